@@ -1,0 +1,33 @@
+"""Gymnasium environments in which contact decides, with Drake and PyBullet behind one interface.
+
+Importing the package registers the environments and nothing more: a simulator is imported when an environment
+that uses it is made.
+"""
+
+from __future__ import annotations
+
+from gymnasium.envs.registration import register, registry
+
+__all__ = ["ENV_IDS"]
+
+_ENTRY_POINT = "contact_envs.cart_pole_soft_walls:CartPoleSoftWallsEnv"
+_MAX_EPISODE_STEPS = 400
+
+# A tenth of the force, and starts that are further out: without the walls' help the pole is lost.
+_HARD = {"max_force": 10.0, "reset_range": (0.35, 1.0, 0.30, 1.0)}
+
+_ENVIRONMENTS = {
+    "CartPoleSoftWalls-v0": {"simulator": "drake"},
+    "CartPoleSoftWallsDrake-v0": {"simulator": "drake"},
+    "CartPoleSoftWallsPyBullet-v0": {"simulator": "pybullet"},
+    "CartPoleSoftWallsHard-v0": {"simulator": "drake", **_HARD},
+    "CartPoleSoftWallsHardDrake-v0": {"simulator": "drake", **_HARD},
+    "CartPoleSoftWallsHardPyBullet-v0": {"simulator": "pybullet", **_HARD},
+}
+
+ENV_IDS = tuple(_ENVIRONMENTS)
+"""The registered environment ids."""
+
+for _id, _kwargs in _ENVIRONMENTS.items():
+    if _id not in registry:
+        register(_id, entry_point=_ENTRY_POINT, max_episode_steps=_MAX_EPISODE_STEPS, kwargs=_kwargs)
