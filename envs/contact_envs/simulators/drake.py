@@ -9,7 +9,17 @@ from contact_envs.dynamics import CartPoleParameters
 from contact_envs.simulators.base import Simulator
 
 try:
-    from pydrake.geometry import AddContactMaterial, Box, ProximityProperties, Sphere
+    from pydrake.geometry import (
+        AddContactMaterial,
+        Box,
+        Cylinder,
+        Meshcat,
+        MeshcatVisualizer,
+        MeshcatVisualizerParams,
+        ProximityProperties,
+        SceneGraph,
+        Sphere,
+    )
     from pydrake.math import RigidTransform
     from pydrake.multibody.plant import (
         AddMultibodyPlantSceneGraph,
@@ -33,35 +43,32 @@ TIP_STIFFNESS_RATIO = 1e12
 
 WALL_THICKNESS = 20.0  # m
 
+CART_COLOUR = np.array([0.17, 0.24, 0.31, 1.0])
+POLE_COLOUR = np.array([0.80, 0.36, 0.20, 1.0])
+WALL_COLOUR = np.array([0.95, 0.77, 0.20, 0.7])
+RAIL_COLOUR = np.array([0.55, 0.58, 0.62, 1.0])
+
 
 class DrakeSimulator(Simulator):
     """See :class:`Simulator`."""
 
     def __init__(
-        self,
-        parameters: CartPoleParameters,
-        physics_step: float,
-        substeps: int,
-        viewer: bool = False,
-        contact_approximation: DiscreteContactApproximation = DiscreteContactApproximation.kTamsi,
+        self, parameters: CartPoleParameters, physics_step: float, substeps: int, viewer: bool = False
     ) -> None:
         super().__init__(parameters, physics_step, substeps, viewer)
         builder = DiagramBuilder()
-        self._plant, _scene_graph = AddMultibodyPlantSceneGraph(builder, physics_step)
-        _build_plant(self._plant, parameters, contact_approximation)
+        self._plant, scene_graph = AddMultibodyPlantSceneGraph(builder, physics_step)
+        _build_plant(self._plant, parameters, visible=viewer)
         self._impulse = _add_wall_impulse(builder, self._plant, physics_step)
-        self._meshcat = None
         if viewer:
-            raise NotImplementedError
-        diagram = builder.Build()
+            _add_meshcat(builder, scene_graph)
+        self._diagram = builder.Build()
 
-        self._stepper = DrakeTimeStepper(diagram)
-        context = self._stepper.get_mutable_context()
-        plant_context = self._plant.GetMyMutableContextFromRoot(context)
-        self._context = context
-        self._plant_context = plant_context
-        self._impulse_context = self._impulse.GetMyMutableContextFromRoot(context)
-        self._force = self._plant.get_actuation_input_port().FixValue(plant_context, np.zeros(1))
+        self._stepper = DrakeTimeStepper(self._diagram)
+        self._context = self._stepper.get_mutable_context()
+        self._plant_context = self._plant.GetMyMutableContextFromRoot(self._context)
+        self._impulse_context = self._impulse.GetMyMutableContextFromRoot(self._context)
+        self._force = self._plant.get_actuation_input_port().FixValue(self._plant_context, np.zeros(1))
         self._steps = 0
 
     def reset(self, state: NDArray[np.float64]) -> None:
@@ -83,18 +90,19 @@ class DrakeSimulator(Simulator):
         return state, impulse / (self.substeps * self.physics_step)
 
     def show(self) -> None:
-        pass
+        if self.viewer:
+            self._diagram.ForcedPublish(self._context)
 
     def close(self) -> None:
-        pass
+        """Nothing to give back: Drake's objects, and the port Meshcat listens on, go with this one."""
 
 
-def _build_plant(
-    plant: MultibodyPlant, parameters: CartPoleParameters, contact_approximation: DiscreteContactApproximation
-) -> None:
+def _build_plant(plant: MultibodyPlant, parameters: CartPoleParameters, visible: bool) -> None:
     """Cart on a rail along x, pole on a hinge about y, tip sphere, two half-spaces as walls."""
     plant.set_contact_model(ContactModel.kPoint)
-    plant.set_discrete_contact_approximation(contact_approximation)
+    # Without friction and dissipation all of Drake's approximations give this motion; this one is the
+    # quickest.
+    plant.set_discrete_contact_approximation(DiscreteContactApproximation.kTamsi)
     # Live ports: the contact forces read at an instant are those of the step that starts there, not of the
     # last one.
     plant.SetUseSampledOutputPorts(False)
@@ -118,6 +126,8 @@ def _build_plant(
         plant.RegisterCollisionGeometry(
             plant.world_body(), block, Box(*[WALL_THICKNESS] * 3), f"{name}_wall", material
         )
+    if visible:
+        _add_looks(plant, parameters)
     plant.Finalize()
 
 
@@ -134,6 +144,30 @@ def _material(stiffness: float) -> ProximityProperties:
     )
     properties.AddProperty("material", "relaxation_time", 0.0)
     return properties
+
+
+def _add_looks(plant: MultibodyPlant, parameters: CartPoleParameters) -> None:
+    """What Meshcat shows; nothing here touches the physics."""
+    length, radius = parameters.pole_length, parameters.tip_radius
+    pole_centre = RigidTransform([0.0, 0.0, 0.5 * length])
+    tip = RigidTransform([0.0, 0.0, length])
+    cart, pole, world = plant.GetBodyByName("cart"), plant.GetBodyByName("pole"), plant.world_body()
+    plant.RegisterVisualGeometry(cart, RigidTransform(), Box(0.24, 0.16, 0.1), "cart", CART_COLOUR)
+    plant.RegisterVisualGeometry(pole, pole_centre, Cylinder(0.4 * radius, length), "rod", POLE_COLOUR)
+    plant.RegisterVisualGeometry(pole, tip, Sphere(radius), "ball", POLE_COLOUR)
+    rail = RigidTransform([0.0, 0.0, -0.06])
+    plant.RegisterVisualGeometry(world, rail, Box(3.0, 0.04, 0.02), "rail", RAIL_COLOUR)
+    for name, side in (("right", 1.0), ("left", -1.0)):
+        centre = RigidTransform([side * (parameters.wall_distance + radius + 0.05), 0.0, length])
+        plant.RegisterVisualGeometry(world, centre, Box(0.1, 0.3, 0.6), f"{name}_look", WALL_COLOUR)
+
+
+def _add_meshcat(builder: DiagramBuilder, scene_graph: SceneGraph) -> None:
+    """A page on a local port, which Drake prints. The environment publishes by itself, hence the long
+    period."""
+    MeshcatVisualizer.AddToBuilder(
+        builder, scene_graph, Meshcat(), MeshcatVisualizerParams(publish_period=1e9)
+    )
 
 
 def _add_wall_impulse(
