@@ -6,6 +6,8 @@ that uses it is made.
 
 from __future__ import annotations
 
+from typing import Any
+
 from gymnasium.envs.registration import register, registry
 
 __all__ = ["ENV_IDS"]
@@ -13,10 +15,10 @@ __all__ = ["ENV_IDS"]
 _ENTRY_POINT = "contact_envs.cart_pole_soft_walls:CartPoleSoftWallsEnv"
 _MAX_EPISODE_STEPS = 400
 
-# A tenth of the force, and starts that are further out: without the walls' help the pole is lost.
-_HARD = {"max_force": 10.0, "reset_range": (0.35, 1.0, 0.30, 1.0)}
+# A tenth of the force, and starts that are further out.
+_HARD: dict[str, Any] = {"max_force": 10.0, "reset_range": (0.35, 1.0, 0.30, 1.0)}
 
-_ENVIRONMENTS = {
+_ENVIRONMENTS: dict[str, dict[str, Any]] = {
     "CartPoleSoftWalls-v0": {"simulator": "drake"},
     "CartPoleSoftWallsDrake-v0": {"simulator": "drake"},
     "CartPoleSoftWallsPyBullet-v0": {"simulator": "pybullet"},

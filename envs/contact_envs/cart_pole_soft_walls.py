@@ -15,7 +15,8 @@ from gymnasium.utils import EzPickle
 from numpy.typing import ArrayLike, NDArray
 
 from contact_envs import dynamics
-from contact_envs.dynamics import CartPoleParameters, LcsMatrices, checked_number
+from contact_envs._validation import finite, finite_vector, non_negative, positive
+from contact_envs.dynamics import CartPoleParameters, LcsMatrices
 from contact_envs.simulators import Simulator, simulator_class
 
 __all__ = ["CartPoleSoftWallsEnv"]
@@ -27,11 +28,11 @@ class CartPoleSoftWallsEnv(gym.Env[NDArray[np.float64], NDArray[np.float32]], Ez
 
     A pole is hinged on a cart that runs on a rail without friction. Two soft, frictionless, elastic walls
     stand on either side of the pole's tip. The task is to bring pole and cart to rest upright at the origin
-    by pushing the cart; the walls may get in the way or help. It is the task of section IV-A of the paper
-    this package accompanies, and a standard one for control through contact.
+    by pushing the cart; the walls may get in the way, or help. It is the task of section IV-A of the paper
+    that this package accompanies.
 
-    The contact is the physics engine's own (a sphere at the pole's tip against a compliant wall). Two engines
-    stand behind the same interface; they agree with each other far more closely than either agrees with the
+    The contact is the physics engine's own: a sphere at the pole's tip against a compliant wall. Two engines
+    stand behind the same interface. They agree with each other far more closely than either agrees with the
     exact equations of motion, because both step in time to first order.
 
     ## Action space
@@ -158,21 +159,21 @@ class CartPoleSoftWallsEnv(gym.Env[NDArray[np.float64], NDArray[np.float32]], Ez
             render_mode,
         )
         self.parameters = _plant_parameters(parameters)
-        self.max_force = checked_number("max_force", max_force)
-        self.control_step = checked_number("control_step", control_step)
-        self.physics_step = checked_number("physics_step", physics_step)
-        self.state_weights = _non_negative_vector("state_weights", state_weights)
-        self.action_weight = checked_number("action_weight", action_weight, zero_allowed=True)
-        self.reward_constant = float(reward_constant)
-        self.reset_range = _non_negative_vector("reset_range", reset_range)
-        self.theta_limit = checked_number("theta_limit", theta_limit)
-        self.x_limit = checked_number("x_limit", x_limit)
+        self.max_force = positive("max_force", max_force)
+        self.control_step = positive("control_step", control_step)
+        self.physics_step = positive("physics_step", physics_step)
+        self.state_weights = _magnitudes("state_weights", state_weights)
+        self.action_weight = non_negative("action_weight", action_weight)
+        self.reward_constant = finite("reward_constant", reward_constant)
+        self.reset_range = _magnitudes("reset_range", reset_range)
+        self.theta_limit = positive("theta_limit", theta_limit)
+        self.x_limit = positive("x_limit", x_limit)
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise ValueError(
                 f"render_mode must be None or one of {self.metadata['render_modes']}, got {render_mode!r}"
             )
         self.render_mode = render_mode
-        self.metadata = {**self.metadata, "render_fps": round(1.0 / self.control_step)}
+        self.metadata = {**self.metadata, "render_fps": max(1, round(1.0 / self.control_step))}
 
         self.action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
         self.observation_space = spaces.Box(-np.inf, np.inf, (4,), np.float64)
@@ -301,9 +302,7 @@ class CartPoleSoftWallsEnv(gym.Env[NDArray[np.float64], NDArray[np.float32]], Ez
             raise ValueError(f"reset accepts options {{'state': (4,)}} only, got also {unknown}")
         if options.get("state") is None:
             return None
-        state = np.array(options["state"], dtype=np.float64)
-        if state.shape != (4,) or not np.isfinite(state).all():
-            raise ValueError(f"options['state'] must be 4 finite numbers, got {options['state']!r}")
+        state = finite_vector("options['state']", options["state"], 4)
         if self._terminal(state):
             raise ValueError(
                 f"options['state'] must be inside |x| <= {self.x_limit} and |theta| <= {self.theta_limit}, "
@@ -326,10 +325,10 @@ def _plant_parameters(parameters: CartPoleParameters | Mapping[str, float] | Non
     return CartPoleParameters(**parameters)
 
 
-def _non_negative_vector(name: str, values: Sequence[float]) -> NDArray[np.float64]:
-    vector = np.array(values, dtype=np.float64)
-    if vector.shape != (4,) or not np.isfinite(vector).all() or (vector < 0.0).any():
-        raise ValueError(f"{name} must be 4 finite numbers >= 0 (x, x_dot, theta, theta_dot), got {values!r}")
+def _magnitudes(name: str, values: Sequence[float]) -> NDArray[np.float64]:
+    vector = finite_vector(name, values, 4)
+    if (vector < 0.0).any():
+        raise ValueError(f"{name} must be >= 0 in each of x, x_dot, theta, theta_dot, got {values!r}")
     return vector
 
 
@@ -343,7 +342,4 @@ def _substeps(control_step: float, physics_step: float) -> int:
 
 
 def _clipped_action(action: ArrayLike) -> float:
-    values = np.asarray(action, dtype=np.float64)
-    if values.shape != (1,) or not np.isfinite(values).all():
-        raise ValueError(f"action must be one finite number, shape (1,), got {action!r}")
-    return float(np.clip(values[0], -1.0, 1.0))
+    return min(1.0, max(-1.0, float(finite_vector("action", action, 1)[0])))

@@ -19,11 +19,12 @@ wall arrays are ordered (right wall at +w, left wall at -w) everywhere.
 from __future__ import annotations
 
 import dataclasses
-import math
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from contact_envs._validation import non_negative, positive
 
 __all__ = [
     "CartPoleParameters",
@@ -69,21 +70,18 @@ class CartPoleParameters:
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
-            value = checked_number(
-                field.name, getattr(self, field.name), zero_allowed=field.name == "gravity"
-            )
-            object.__setattr__(self, field.name, value)
+            check = non_negative if field.name == "gravity" else positive
+            object.__setattr__(self, field.name, check(field.name, getattr(self, field.name)))
 
 
 class LcsMatrices(NamedTuple):
-    """A linear complementarity system, float64, in environment units (state SI, action in [-1, 1], forces
-    N)::
+    """A linear complementarity system in environment units: state SI, action in [-1, 1], forces in N::
 
         s' = A s + B a + C lam + d
         0 <= lam  ⟂  D s + E a + F lam + c >= 0
 
-    Shapes: A (4, 4), B (4, 1), C (4, 2), d (4,), D (2, 4), E (2, 1), F (2, 2), c (2,). ``lam`` holds the
-    forces of the right and the left wall in N; the gap ``D s + E a + F lam + c`` is in m.
+    All float64. Shapes: A (4, 4), B (4, 1), C (4, 2), d (4,), D (2, 4), E (2, 1), F (2, 2), c (2,). ``lam``
+    holds the forces of the right and the left wall in N; the gap ``D s + E a + F lam + c`` is in m.
     """
 
     A: NDArray[np.float64]
@@ -94,24 +92,6 @@ class LcsMatrices(NamedTuple):
     E: NDArray[np.float64]
     F: NDArray[np.float64]
     c: NDArray[np.float64]
-
-
-def checked_number(name: str, value: object, *, zero_allowed: bool = False) -> float:
-    """``value`` as a float, or an error that names the argument.
-
-    :param name: the argument's name, for the error
-    :param value: what the caller gave
-    :param zero_allowed: accept zero beside the positive numbers
-    :raises TypeError: ``value`` is not a real number
-    :raises ValueError: ``value`` is not finite, negative, or zero where that is not allowed
-    """
-    accepted = "a finite number >= 0" if zero_allowed else "a finite number > 0"
-    if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
-        raise TypeError(f"{name} must be {accepted}, got {value!r}")
-    number = float(value)
-    if not math.isfinite(number) or number < 0.0 or (number == 0.0 and not zero_allowed):
-        raise ValueError(f"{name} must be {accepted}, got {value!r}")
-    return number
 
 
 def tip_position(state: ArrayLike, parameters: CartPoleParameters) -> NDArray[np.float64]:
@@ -163,8 +143,7 @@ def equations_of_motion(
 
 
 def mechanical_energy(state: ArrayLike, parameters: CartPoleParameters) -> NDArray[np.float64]:
-    """Kinetic energy, gravity and what the walls store, J. Constant along any motion with zero force on the
-    cart.
+    """Kinetic energy, gravity and what the walls store, J: constant while the force on the cart is zero.
 
     :param state: (..., 4)
     :return: (...)
@@ -208,7 +187,7 @@ def integrate(
     from scipy.integrate import solve_ivp  # here: importing the package must stay quick
 
     parameters = CartPoleParameters() if parameters is None else parameters
-    duration = checked_number("duration", duration)
+    duration = positive("duration", duration)
     current, time = np.array(state, dtype=np.float64), 0.0
 
     def derivative(_: float, s: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -245,10 +224,12 @@ def true_lcs(
 ) -> LcsMatrices:
     """The linear complementarity system of the cart-pole, linearised about upright.
 
-    Between two control instants the linear equations are solved exactly (matrix exponential) with the action
-    and the wall forces held constant. A wall's force is ``k`` times its penetration, i.e. complementary to
-    the gap ``w -+ (x + l theta) + lam / k``; the penetration changes within the control step, and
-    ``gap_instant`` says when it is read.
+    Between two control instants the linear equations are solved exactly (matrix exponential), with the action
+    and the wall forces held constant. A wall's force is ``k`` times the penetration, hence complementary to
+    the gap ``w -+ (x + l theta) + lam / k``. The penetration changes within the control step; ``gap_instant``
+    says when it is read. The middle is the default because it is measured to be best: on random states within
+    3 cm of a wall its one-step error is less than a third of that of the start and of the end
+    (``tests/contact_envs/test_true_lcs.py`` repeats the comparison).
 
     :param parameters: of the plant; the default cart-pole if None
     :param control_step: s
@@ -261,9 +242,9 @@ def true_lcs(
     from scipy.linalg import expm  # here: importing the package must stay quick
 
     parameters = CartPoleParameters() if parameters is None else parameters
-    control_step = checked_number("control_step", control_step)
-    action_scale = checked_number("action_scale", action_scale)
-    gap_instant = checked_number("gap_instant", gap_instant, zero_allowed=True)
+    control_step = positive("control_step", control_step)
+    action_scale = positive("action_scale", action_scale)
+    gap_instant = non_negative("gap_instant", gap_instant)
     if gap_instant > 1.0:
         raise ValueError(f"gap_instant must be a fraction of the control step in [0, 1], got {gap_instant!r}")
 

@@ -1,5 +1,8 @@
 """The cart-pole in Drake: a discrete multibody plant with point contact."""
 
+# Drake's stubs write ndarray's type parameters the wrong way round, and type AddSystem as returning a System.
+# mypy: disable-error-code="arg-type, call-overload, operator, return-value"
+
 from __future__ import annotations
 
 import numpy as np

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import os
 import sys
+import weakref
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,11 +41,13 @@ class PyBulletSimulator(Simulator):
         self, parameters: CartPoleParameters, physics_step: float, substeps: int, viewer: bool = False
     ) -> None:
         super().__init__(parameters, physics_step, substeps, viewer)
-        self._client: int | None = _open_window() if viewer else pybullet.connect(pybullet.DIRECT)
+        self._client = _open_window() if viewer else pybullet.connect(pybullet.DIRECT)
+        # Also for a simulator that nobody closed: a process has a limited number of servers.
+        self._disconnect = weakref.finalize(self, pybullet.disconnect, self._client)
         pybullet.setGravity(0.0, 0.0, -parameters.gravity, physicsClientId=self._client)
+        # Without warm starts, so that no contact of the last episode can reach into the next one.
         pybullet.setPhysicsEngineParameter(
             fixedTimeStep=physics_step,
-            numSubSteps=0,
             warmStartingFactor=0.0,
             physicsClientId=self._client,
         )
@@ -75,9 +78,7 @@ class PyBulletSimulator(Simulator):
         """PyBullet's window draws by itself."""
 
     def close(self) -> None:
-        if self._client is not None:
-            pybullet.disconnect(self._client)
-            self._client = None
+        self._disconnect()
 
 
 def _open_window() -> int:
