@@ -66,6 +66,18 @@ def test_pressing_a_wall_reddens_it():
     assert (red(draw(IN_RIGHT_WALL))[:, 1] > rendering.WIDTH / 2).all()
 
 
+def test_a_walls_force_is_an_arrow_from_the_tip_inwards():
+    def arrow(state) -> np.ndarray:
+        return np.argwhere(np.abs(draw(state).astype(int) - [192, 40, 45]).sum(axis=-1) < 10)
+
+    assert len(arrow(UPRIGHT)) == 0
+    right, left = arrow(IN_RIGHT_WALL), arrow(-IN_RIGHT_WALL)
+    assert min(len(right), len(left)) > 50
+    tip = (0.3 + 0.6 * np.sin(0.2)) * rendering.WIDTH / 2.4
+    assert right[:, 1].max() < rendering.WIDTH / 2 + tip
+    assert left[:, 1].min() > rendering.WIDTH / 2 - tip
+
+
 def test_the_force_is_an_arrow_on_the_side_it_points_to():
     right, left = changed(draw(), draw(force=50.0)), changed(draw(), draw(force=-50.0))
     assert (right[:, 1] > rendering.WIDTH / 2).all()

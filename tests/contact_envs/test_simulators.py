@@ -96,6 +96,14 @@ def test_wall_forces_are_the_impulse_of_the_impact(engine, case, wall):
     np.testing.assert_allclose(impulse[1] - impulse[0], gained, rtol=0.02)
 
 
+def test_wall_force_is_that_of_the_step_itself_and_not_of_the_one_before(engine):
+    simulator = simulator_class(engine)(PARAMETERS, 0.001, 1)
+    for x in (0.45, 0.0, -0.5):
+        forces = run(simulator, [x, 0.0, 0.0, 0.0], [0.0])[0, 4:]
+        depth = np.maximum(np.array([x, -x]) - 0.35, 0.0)
+        np.testing.assert_allclose(forces, 700.0 * depth, rtol=0.02)
+
+
 def test_wall_force_deep_inside_a_wall_is_its_spring_force(engine):
     """Also further in than any wall is thick."""
     for x, wall in ((0.85, 0), (-0.85, 1), (1.6, 0)):

@@ -85,8 +85,8 @@ class DrakeSimulator(Simulator):
         self._force.GetMutableData().get_mutable_value().SetAtIndex(0, force)
         self._impulse.set_integral_value(self._impulse_context, np.zeros(2))
         self._steps += self.substeps
-        # Half a step short of the end: which physics steps have run by then does not hang on rounding in the
-        # time.
+        # Half a step short of the end, so that rounding in the time cannot decide which physics steps have
+        # run.
         self._stepper.AdvanceTo((self._steps - 0.5) * self.physics_step)
         state = self._plant.GetPositionsAndVelocities(self._plant_context)[[0, 2, 1, 3]]
         impulse = self._impulse.get_output_port().Eval(self._impulse_context)
@@ -106,8 +106,8 @@ def _build_plant(plant: MultibodyPlant, parameters: CartPoleParameters, visible:
     # Without friction and dissipation all of Drake's approximations give this motion; this one is the
     # quickest.
     plant.set_discrete_contact_approximation(DiscreteContactApproximation.kTamsi)
-    # Live ports: the contact forces read at an instant are those of the step that starts there, not of the
-    # last one.
+    # Sampled ports keep the last step's values for whoever looks between two steps. Nobody does here, and it
+    # costs time.
     plant.SetUseSampledOutputPorts(False)
     plant.mutable_gravity_field().set_gravity_vector([0.0, 0.0, -parameters.gravity])
 
