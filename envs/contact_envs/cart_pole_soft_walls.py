@@ -48,12 +48,12 @@ class CartPoleSoftWallsEnv(gym.Env[NDArray[np.float64], NDArray[np.float32]], Ez
     `Box(-inf, inf, (4,), float64)`. The start and the end of an episode bound positions in practice (see
     below); no bound is promised on the observation that ends an episode, nor on velocities.
 
-    | Num | Observation                                 | Min  | Max | Unit  |
-    |-----|---------------------------------------------|------|-----|-------|
-    | 0   | cart position `x`                           | -inf | inf | m     |
-    | 1   | cart velocity `x_dot`                       | -inf | inf | m/s   |
+    | Num | Observation                                     | Min  | Max | Unit  |
+    |-----|-------------------------------------------------|------|-----|-------|
+    | 0   | cart position `x`                               | -inf | inf | m     |
+    | 1   | cart velocity `x_dot`                           | -inf | inf | m/s   |
     | 2   | pole angle `theta`, 0 upright, > 0 to the right | -inf | inf | rad   |
-    | 3   | pole angular velocity `theta_dot`           | -inf | inf | rad/s |
+    | 3   | pole angular velocity `theta_dot`               | -inf | inf | rad/s |
 
     The tip is at `x + pole_length * sin(theta)`; the walls at `-wall_distance` and `+wall_distance` act on
     it.
