@@ -12,6 +12,7 @@ Evaluation does not touch training: it has its own environments, and leaves ever
 from __future__ import annotations
 
 import contextlib
+import copy
 import random
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -54,13 +55,16 @@ class Evaluator:
 
     :param env_id: a registered environment with a Box action space
     :param n_episodes: the first so many of :data:`RESET_SEEDS`
-    :raises ValueError: ``n_episodes`` is out of range
+    :raises ValueError: ``n_episodes`` is out of range, or the action space is not a Box
     """
 
     def __init__(self, env_id: str, n_episodes: int = len(RESET_SEEDS)) -> None:
         if not 1 <= n_episodes <= len(RESET_SEEDS):
             raise ValueError(f"n_episodes must be in 1..{len(RESET_SEEDS)}, got {n_episodes!r}")
         self.envs = [gym.make(env_id) for _ in range(n_episodes)]
+        if not isinstance(self.envs[0].action_space, gym.spaces.Box):
+            raise ValueError(f"env_id must name an environment with a Box action space, got {env_id!r}")
+        self.action_space = self.envs[0].action_space
         self.seeds = RESET_SEEDS[:n_episodes]
 
     def returns(self, controller: Controller) -> np.ndarray:
@@ -68,7 +72,7 @@ class Evaluator:
 
         :param controller: its actions are clipped to the action space
         """
-        space = self.envs[0].action_space
+        space = self.action_space
         observations = np.array([env.reset(seed=s)[0] for env, s in zip(self.envs, self.seeds, strict=True)])
         returns = np.zeros(len(self.envs))
         alive = np.arange(len(self.envs))
@@ -104,13 +108,19 @@ def score(policy: Controller | BaseAlgorithm, env_id: str, n_episodes: int = len
 
 
 def controller_of(model: BaseAlgorithm) -> Controller:
-    """The deterministic policy of a model, with the observation normalisation it is trained with, if any."""
+    """The deterministic policy of a model, with the observation normalisation it is trained with, if any.
+
+    It is a copy of the present policy: a solver that starts from its last solution would otherwise carry a
+    trace of the evaluation, of the size of rounding errors, into training.
+    """
     normalisation = model.get_vec_normalize_env()
+    # The distribution holds tensors of the last forward pass: torch refuses a deep copy, nobody needs one.
+    distribution = getattr(model.policy, "action_dist", None)
+    policy = copy.deepcopy(model.policy, memo={id(distribution): copy.copy(distribution)})
 
     def act(observations: np.ndarray) -> np.ndarray:
-        if normalisation is not None:
-            observations = normalisation.normalize_obs(observations)
-        return model.predict(observations, deterministic=True)[0]
+        seen = observations if normalisation is None else normalisation.normalize_obs(observations)
+        return policy.predict(seen, deterministic=True)[0]
 
     return act
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Iterator
 
 import gymnasium as gym
 import numpy as np
@@ -10,18 +11,64 @@ from scipy.linalg import solve_discrete_are
 
 from benchmarks.evaluation import Controller
 from contact_envs.cart_pole_soft_walls import CartPoleSoftWallsEnv
+from sb3_mpc_policy import LcsMpc, LinearComplementaritySystem, QuadraticReward, hyperparams
+
+CONTROLLER_SETTINGS = ("horizon", "terminal_value", "penalty", "smoothing", "n_iterations", "solver")
+"""What the oracle shares with the policy."""
+
+
+@contextlib.contextmanager
+def cart_pole(env_id: str) -> Iterator[CartPoleSoftWallsEnv]:
+    """A cart-pole environment without its wrappers, to ask for its numbers.
+
+    :raises TypeError: ``env_id`` names some other environment
+    """
+    with contextlib.closing(gym.make(env_id)) as env:
+        plant = env.unwrapped
+        if not isinstance(plant, CartPoleSoftWallsEnv):
+            raise TypeError(f"env_id must name a cart-pole with soft walls, got {env_id!r}")
+        yield plant
 
 
 def lqr(env_id: str) -> Controller:
     """Linear-quadratic regulator of the true model without its walls, for the environment's own reward.
 
-    :param env_id: an environment with ``true_lcs()``, see :mod:`contact_envs`
+    :param env_id: see :func:`cart_pole`
     """
-    with contextlib.closing(gym.make(env_id)) as env:
-        plant: CartPoleSoftWallsEnv = env.unwrapped
+    with cart_pole(env_id) as plant:
         model = plant.true_lcs()
         Q = np.diag(plant.state_weights)
         R = np.array([[plant.action_weight * plant.max_force**2]])
     P = solve_discrete_are(model.A, model.B, Q, R)
     K = np.linalg.solve(R + model.B.T @ P @ model.B, model.B.T @ P @ model.A)
-    return lambda observations: -observations @ K.T
+
+    def act(observations: np.ndarray) -> np.ndarray:
+        return -observations @ K.T
+
+    return act
+
+
+def oracle(env_id: str) -> Controller:
+    """The learned policy's controller with the true model and the true reward: "MPC with true dynamics".
+
+    Horizon, penalty, scales and the like are the environment's tuned ones; untuned, states are scaled by the
+    reset range.
+
+    :param env_id: see :func:`cart_pole`
+    """
+    tuned = hyperparams(env_id).get("policy_kwargs", {})
+    with cart_pole(env_id) as plant:
+        controller = LcsMpc(
+            LinearComplementaritySystem.from_matrices(
+                *plant.true_lcs(), state_scale=tuned.get("state_scale", plant.reset_range)
+            ),
+            QuadraticReward(plant.state_weights, plant.action_weight * plant.max_force**2),
+            plant.action_space.low,
+            plant.action_space.high,
+            **{name: tuned[name] for name in CONTROLLER_SETTINGS if name in tuned},
+        )
+
+    def act(observations: np.ndarray) -> np.ndarray:
+        return controller.plan(observations).actions[:, 0]
+
+    return act

@@ -24,7 +24,10 @@ def test_every_data_file_beside_the_sources_is_installed() -> None:
     roots = {"sb3_mpc_policy": ROOT / "sb3_mpc_policy", "contact_envs": ROOT / "envs" / "contact_envs"}
     for package, root in roots.items():
         patterns = SETUP["options.package_data"].get(package, "").split()
-        for file in (f for f in root.rglob("*") if f.is_file() and "__pycache__" not in f.parts):
-            if file.suffix != ".py":
-                name = file.relative_to(root)
-                assert any(name.match(pattern) for pattern in patterns), f"{package}: {name} not in setup.cfg"
+        names = (file.relative_to(root) for file in root.rglob("*") if file.is_file())
+        for name in names:
+            left_by_tools = any(part == "__pycache__" or part.startswith(".") for part in name.parts)
+            if name.suffix != ".py" and not left_by_tools:
+                assert any(name.match(pattern) for pattern in patterns), (
+                    f"{package}: {name} is not in setup.cfg"
+                )

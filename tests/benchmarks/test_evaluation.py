@@ -12,10 +12,10 @@ import torch
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-import contact_envs  # noqa: F401 - registers the environments
+import sb3_mpc_policy  # noqa: F401 - registers the policy and the environments
 from benchmarks import evaluation
 from benchmarks.evaluation import Evaluation, EvaluationCallback, Evaluator
-from benchmarks.references import lqr
+from benchmarks.references import lqr, oracle
 
 ENV_ID = "CartPoleSoftWallsPyBullet-v0"
 ORACLE = 1000.0
@@ -104,6 +104,20 @@ def test_score_of_lqr_is_that_of_a_plain_loop_over_episodes() -> None:
     assert min(returns) > 5_000  # of at most 6,000: it balances
 
 
+def test_the_oracle_balances_every_pole_that_lqr_does(evaluator: Evaluator) -> None:
+    assert evaluator.returns(oracle(ENV_ID)) == pytest.approx(evaluator.returns(lqr(ENV_ID)), rel=0.05)
+
+
+def test_references_are_for_the_cart_pole() -> None:
+    with pytest.raises(TypeError, match="env_id"):
+        lqr("Pendulum-v1")
+
+
+def test_an_environment_without_a_box_of_actions_is_refused() -> None:
+    with pytest.raises(ValueError, match="env_id"):
+        Evaluator("CartPole-v1", n_episodes=1)
+
+
 def test_an_episode_leaves_the_batch_when_it_is_over(evaluator: Evaluator) -> None:
     """A controller that pushes to one side drops the poles at different times."""
     batches = []
@@ -154,20 +168,31 @@ def test_number_of_episodes_out_of_range(n_episodes: int) -> None:
 # -- during training --
 
 
-def train(callback: EvaluationCallback | None) -> PPO:
-    model = PPO("MlpPolicy", gym.make(ENV_ID), n_steps=64, batch_size=32, n_epochs=2, seed=3, device="cpu")
+def train(callback: EvaluationCallback | None, policy: str = "MlpPolicy") -> PPO:
+    model = PPO(policy, gym.make(ENV_ID), n_steps=64, batch_size=32, n_epochs=2, seed=3, device="cpu")
     return model.learn(256, callback=callback)
 
 
-def test_training_is_the_same_to_the_bit_with_and_without_evaluation(evaluator: Evaluator) -> None:
-    with_evaluation = train(EvaluationCallback(evaluator, every=64))
+class DrawingEvaluator(Evaluator):
+    """Draws from every global random state while it scores."""
+
+    def score(self, controller):
+        random.random(), np.random.rand(), torch.rand(1)  # noqa: NPY002
+        return super().score(controller)
+
+
+@pytest.mark.parametrize("policy", ["MlpPolicy", "MpcLcsPolicy"])
+def test_training_is_the_same_to_the_bit_with_and_without_evaluation(policy: str) -> None:
+    evaluator = DrawingEvaluator(ENV_ID, n_episodes=2)
+    with_evaluation = train(EvaluationCallback(evaluator, every=64), policy)
     drawn = (random.random(), np.random.rand(), torch.rand(1).item())  # noqa: NPY002
-    without = train(None)
+    without = train(None, policy)
     assert drawn == (random.random(), np.random.rand(), torch.rand(1).item())  # noqa: NPY002
     states = with_evaluation.policy.state_dict(), without.policy.state_dict()
     for name, value in states[0].items():
         assert torch.equal(value, states[1][name]), name
     assert np.array_equal(with_evaluation._last_obs, without._last_obs)
+    evaluator.close()
 
 
 def test_random_states_outlive_a_policy_that_draws_from_them() -> None:
@@ -187,10 +212,11 @@ def test_evaluations_stand_between_rollouts(evaluator: Evaluator) -> None:
     assert [e.steps for e in every_rollout.evaluations] == [0, 64, 128, 192, 256]
 
 
-def test_the_score_is_that_of_the_policy_at_that_step(evaluator: Evaluator) -> None:
+@pytest.mark.parametrize("policy", ["MlpPolicy", "MpcLcsPolicy"])
+def test_the_last_score_is_that_of_the_trained_model(evaluator: Evaluator, policy: str) -> None:
     callback = EvaluationCallback(evaluator, every=128)
-    model = train(callback)
-    assert callback.evaluations[-1].score == evaluator.score(evaluation.controller_of(model))
+    model = train(callback, policy)
+    assert callback.evaluations[-1].score == pytest.approx(evaluator.score(evaluation.controller_of(model)))
     assert callback.evaluations[-1].score != callback.evaluations[0].score
 
 
