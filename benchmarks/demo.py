@@ -116,7 +116,8 @@ def main(argv: Sequence[str] | None = None) -> None:
             args.env, settings, args.seed, args.steps, [ProgressCallback(progress, bar, args.steps), scored]
         )
 
-    evaluations = scored.evaluations
+    policy, evaluations = model.policy, scored.evaluations
+    assert isinstance(policy, MpcLcsPolicy)
     references["untrained"] = evaluations[0].score
     scores = {**references, "learned": evaluations[-1].score}
     model.save(args.output / "mpc.zip")
@@ -125,7 +126,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         args.output / "learning_curve.png", evaluations, references, f"{args.env}, seed {args.seed}"
     )
     plots.rollout_animation(
-        args.output / "rollout.gif", args.env, planner(model.policy), liveliest_episode(args.env)
+        args.output / "rollout.gif", args.env, planner(policy), liveliest_episode(args.env)
     )
 
     console.print(table_of(scores))
@@ -143,7 +144,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         ("scores.csv", "the table above"),
         ("mpc.zip", "the trained model: PPO.load(...)"),
     ):
-        console.print(f"  {args.output / name}  {what}")
+        console.print(f"  {args.output / name}  {what}", soft_wrap=True)
     console.print(f"{time.perf_counter() - begun:.0f} s in all")
 
 

@@ -67,7 +67,8 @@ def _curve(
         x, np.maximum(scores, low), color=LEARNED, linewidth=2.0, marker="o", markersize=4, label="PPO + MPC"
     )
     off = scores < low
-    axes.plot(x[off], np.full(off.sum(), low), "v", color=LEARNED, markersize=8, clip_on=False)
+    if off.any():
+        axes.plot(x[off], np.full(off.sum(), low), "v", color=LEARNED, markersize=8, clip_on=False)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.spines[["top", "right"]].set_visible(False)
     axes.grid(axis="y", color=QUIET, alpha=0.25, linewidth=0.8)

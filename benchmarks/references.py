@@ -58,13 +58,15 @@ def oracle(env_id: str) -> Controller:
     """
     tuned = hyperparams(env_id).get("policy_kwargs", {})
     with cart_pole(env_id) as plant:
+        space = plant.action_space
+        assert isinstance(space, gym.spaces.Box)
         controller = LcsMpc(
             LinearComplementaritySystem.from_matrices(
                 *plant.true_lcs(), state_scale=tuned.get("state_scale", plant.reset_range)
             ),
             QuadraticReward(plant.state_weights, plant.action_weight * plant.max_force**2),
-            plant.action_space.low,
-            plant.action_space.high,
+            space.low,
+            space.high,
             **{name: tuned[name] for name in CONTROLLER_SETTINGS if name in tuned},
         )
 
