@@ -1,0 +1,108 @@
+"""Fitting the smooth part of the model directly between rollouts, beside the gradient of eq (16).
+
+The controller works in a small region around its target, the first data come from falls far outside it, and a linear
+model fitted to all of them predicts well and controls badly: the pendulum's curvature and the walls' blows end up in
+A and B. So the fit looks for the *tangent* at the target, by robust local polynomial regression:
+
+* each transition counts by its distance from the target, exp(−½ |(s − target) / (2 scale)|²);
+* quadratic and cubic terms in (s, a) take part in the regression and are dropped from the result: curvature goes to
+  them and not to A and B. A ridge gives them the prior of being small in scaled coordinates;
+* transitions that fit neither, contacts above all, are outliers: Cauchy weights, iteratively reweighted.
+
+The contact parameters C, D, E, F and c are left to the gradient of the prediction loss.
+"""
+
+from __future__ import annotations
+
+from itertools import combinations_with_replacement
+from math import comb
+
+import numpy as np
+import torch
+
+from sb3_mpc_policy.lcs import LinearComplementaritySystem
+from sb3_mpc_policy.transitions import Transitions
+
+__all__ = ["MODEL_FITS", "fit_tangent"]
+
+# "gradient" is the paper's Algorithm 1: nothing but eq (16) changes the model.
+MODEL_FITS = ("least_squares", "gradient")
+
+_WIDTH = 2.0  # of the region, in state scales
+_DEGREES = (2, 3)  # of the terms that take up curvature ...
+_MOST_TERMS = 300  # ... left out where there would be more of them than this
+_LINEAR_RIDGE = 1e-6
+_CURVATURE_RIDGE = 1e-3
+_REWEIGHTINGS = 30
+_INLIERS = 0.4  # share of the data that is taken for undisturbed
+_LEAST_RESIDUAL = 1e-3  # whitened: no data are trusted beyond this
+
+
+@torch.no_grad()
+def fit_tangent(lcs: LinearComplementaritySystem, data: Transitions, target: np.ndarray) -> float:
+    """Fit A, B and d of eq (5a) where the controller works.
+
+    :param lcs: changed in place
+    :param data: N >= 1 transitions
+    :param target: (n_x,) the state the controller tries to reach, environment units
+    :return: median whitened residual of the transitions that are not outliers
+    """
+    scale, action_scale = lcs.state_scale.cpu().numpy(), lcs.action_scale.cpu().numpy()
+    # a target that a learned reward puts far outside the data would leave no data to fit
+    centre = np.clip(target, *np.quantile(data.s, [0.05, 0.95], axis=0)) / scale
+    x, u = data.s / scale - centre, data.a / action_scale
+    step = data.s_next / scale - data.s / scale  # so that the ridge pulls towards s' = s
+    theta, residual = _robust_regression(x, u, step)
+
+    n_x, n_a = lcs.n_states, lcs.n_actions
+    slope, offset = theta[:n_x].T, theta[n_x + n_a]
+    for parameter, value in (
+        (lcs.A_scaled, slope + np.eye(n_x)),
+        (lcs.B_scaled, theta[n_x : n_x + n_a].T),
+        (lcs.d_scaled, offset - slope @ centre),
+    ):
+        parameter.copy_(torch.as_tensor(value))
+    return residual
+
+
+def _robust_regression(x: np.ndarray, u: np.ndarray, step: np.ndarray) -> tuple[np.ndarray, float]:
+    """Coefficients (n_features, n_x) of step in (x, u, 1, curvature), and the residual's scale."""
+    z = np.hstack([x, u])
+    n, n_z = z.shape
+    features = np.hstack([z, np.ones((n, 1)), *_curvature(z)])
+    ridge = np.full(features.shape[1], _CURVATURE_RIDGE)
+    ridge[: n_z + 1] = _LINEAR_RIDGE
+    near = np.exp(-0.5 * np.square(x / _WIDTH).sum(axis=1))
+    near /= near.max()
+    deviation = _median_deviation(step)
+    whitened = step / deviation
+
+    trust = np.ones(n)
+    for _ in range(_REWEIGHTINGS):
+        weighted = features * (near * trust)[:, None]
+        gram = weighted.T @ features + np.diag(ridge)
+        theta = np.linalg.solve(gram, weighted.T @ whitened)
+        # a transition that decides the fit alone has no residual: undo its leverage
+        leverage = (features * np.linalg.solve(gram, weighted.T).T).sum(axis=1)
+        error = np.linalg.norm(whitened - features @ theta, axis=1) / np.sqrt(np.maximum(1.0 - leverage, 1e-3))
+        size = max(1.5 * float(np.quantile(error, _INLIERS)), _LEAST_RESIDUAL)
+        trust = 1.0 / (1.0 + np.square(error / size))
+    return theta * deviation, size
+
+
+def _curvature(z: np.ndarray) -> list[np.ndarray]:
+    """The monomials of each degree in the columns of z, as long as there are not too many of them."""
+    n_z, terms = z.shape[1], []
+    for degree in _DEGREES:
+        if comb(n_z + degree - 1, degree) <= _MOST_TERMS:
+            chosen = combinations_with_replacement(range(n_z), degree)
+            terms.append(np.stack([z[:, index].prod(axis=1) for index in map(list, chosen)], axis=1))
+    return terms
+
+
+def _median_deviation(step: np.ndarray) -> np.ndarray:
+    """(n_x,) robust standard deviation; falls back to the ordinary one, then to one, for components that rest."""
+    robust = 1.4826 * np.median(np.abs(step - np.median(step, axis=0)), axis=0)
+    ordinary = step.std(axis=0)
+    deviation = np.where(robust > 1e-3 * ordinary, robust, ordinary)
+    return np.where(deviation > 1e-12, deviation, 1.0)

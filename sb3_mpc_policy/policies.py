@@ -1,0 +1,338 @@
+"""MpcLcsPolicy: a Gaussian policy whose mean is the first action of a plan over a learned contact model."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from numpy.typing import ArrayLike
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.torch_layers import FlattenExtractor
+from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
+from torch import nn
+
+from sb3_mpc_policy.lcs import LinearComplementaritySystem
+from sb3_mpc_policy.model_fit import MODEL_FITS, fit_tangent
+from sb3_mpc_policy.mpc import ControllerStatistics, LcsMpc, MpcPlan
+from sb3_mpc_policy.prediction import PREDICTION_LOSSES, add_to_backward, step_deviation
+from sb3_mpc_policy.reward import QuadraticReward, fit_cost
+from sb3_mpc_policy.terminal_value import TERMINAL_VALUES, QuadraticCritic
+from sb3_mpc_policy.transitions import TransitionStore
+
+__all__ = ["MpcLcsPolicy"]
+
+# The loss is taken over at most this many transitions, drawn anew for each rollout where there are more.
+_LARGEST_LOSS_BATCH = 4096
+# Exploration at the start, as a share of the action scale.
+_INITIAL_NOISE = 0.2
+
+
+class MpcLcsPolicy(ActorCriticPolicy):
+    """Actor-critic policy for PPO and A2C, ``a ~ N(mu(s), xi)`` with ``mu`` the first action of eq (6).
+
+    Everything but the mean is Stable-Baselines3's own: the critic (unless ``terminal_value="critic"``), the Gaussian,
+    ``forward``, ``evaluate_actions`` up to the prediction loss, saving and loading. The transitions the model has
+    learned from travel with the policy, so that training goes on where it stopped.
+
+    :param observation_space: one-dimensional Box
+    :param action_space: one-dimensional Box
+    :param lr_schedule: learning rate, a function of the remaining progress
+    :param net_arch: layers of the critic, a list or ``dict(vf=[...])``
+    :param log_std_init: logarithm of the initial standard deviation of every action, environment units; a fifth of
+        the action scale where None
+    :param horizon: H >= 1, control steps
+    :param n_contacts: n_lambda >= 0
+    :param reward: a :class:`QuadraticReward`, or its arguments as a dict; None to learn one from the rewards observed
+    :param terminal_value: "riccati", "critic" or "none"
+    :param penalty: rho of the relaxation, relative to the size of the cost
+    :param smoothing: epsilon of the relaxation, scaled coordinates
+    :param n_iterations: passes of the relaxation
+    :param solver: "auto", "daqp" or "cvxpylayers"
+    :param prediction_coef: alpha of eq (15)
+    :param prediction_loss: "prediction" (eq 12) or "violation" (Jin et al. 2022)
+    :param model_fit: "least_squares" between rollouts, or "gradient" for eq (16) alone, as the paper has it
+    :param policy_gradient: whether the gradient of PPO's own loss reaches the model, as in eq (16)
+    :param replay: True to learn from all transitions so far, False from the current rollout alone (the paper's D_k)
+    :param state_scale: (n_x,) size of each state; from the first rollout where None
+    :param action_scale: (n_a,); half the range of a bounded action, else one, where None
+    :param initial_lcs: start from this model (copied)
+    :param kwargs: further arguments of ``ActorCriticPolicy``
+    :raise ValueError: for spaces or arguments that the controller has no use for; the message says which
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Space,
+        lr_schedule: Schedule,
+        net_arch: list[int] | dict[str, list[int]] | None = None,
+        activation_fn: type[nn.Module] = nn.Tanh,
+        ortho_init: bool = True,
+        use_sde: bool = False,
+        log_std_init: float | None = None,
+        *,
+        horizon: int = 10,
+        n_contacts: int = 2,
+        reward: QuadraticReward | dict[str, Any] | None = None,
+        terminal_value: str = "riccati",
+        penalty: float = 1000.0,
+        smoothing: float = 1e-6,
+        n_iterations: int = 2,
+        solver: str = "auto",
+        prediction_coef: float = 100.0,
+        prediction_loss: str = "prediction",
+        model_fit: str = "least_squares",
+        policy_gradient: bool = True,
+        replay: bool = True,
+        state_scale: ArrayLike | None = None,
+        action_scale: ArrayLike | None = None,
+        initial_lcs: LinearComplementaritySystem | None = None,
+        **kwargs: Any,
+    ) -> None:
+        n_states, n_actions = _check_spaces(observation_space, action_space)
+        if use_sde:
+            raise ValueError("use_sde must be False: MpcLcsPolicy has the paper's Gaussian (eq 1), got True")
+        extractor = kwargs.get("features_extractor_class", FlattenExtractor)
+        if extractor is not FlattenExtractor:
+            raise ValueError(
+                f"features_extractor_class must be FlattenExtractor: the model needs the state, got {extractor}"
+            )
+        if not (np.isfinite(prediction_coef) and prediction_coef >= 0):
+            raise ValueError(f"prediction_coef must be a finite number >= 0, got {prediction_coef!r}")
+        for name, value, accepted in (
+            ("terminal_value", terminal_value, TERMINAL_VALUES),
+            ("prediction_loss", prediction_loss, PREDICTION_LOSSES),
+            ("model_fit", model_fit, MODEL_FITS),
+        ):
+            if value not in accepted:
+                raise ValueError(f"{name} must be one of {sorted(accepted)}, got {value!r}")
+        if isinstance(reward, dict):
+            reward = QuadraticReward(**reward)
+        if reward is not None and not isinstance(reward, QuadraticReward):
+            raise TypeError(f"reward must be a QuadraticReward, a dict of its arguments or None, got {reward!r}")
+
+        self._mpc_arguments: dict[str, Any] = dict(
+            horizon=horizon, n_contacts=n_contacts, reward=reward, terminal_value=terminal_value, penalty=penalty,
+            smoothing=smoothing, n_iterations=n_iterations, solver=solver, prediction_coef=prediction_coef,
+            prediction_loss=prediction_loss, model_fit=model_fit, policy_gradient=policy_gradient, replay=replay,
+            state_scale=state_scale, action_scale=action_scale, initial_lcs=initial_lcs, log_std_init=log_std_init,
+        )  # fmt: skip
+        self._sizes = n_states, n_actions
+        super().__init__(
+            observation_space,
+            action_space,
+            lr_schedule,
+            net_arch=dict(pi=[], vf=_critic_layers(net_arch, terminal_value)),
+            activation_fn=activation_fn,
+            ortho_init=ortho_init,
+            use_sde=False,
+            log_std_init=0.0,
+            **kwargs,
+        )
+
+    _scale_is_set: torch.Tensor
+    value_net: nn.Module  # type: ignore[assignment]  # linear, or a QuadraticCritic
+
+    # -- construction -------------------------------------------------------------------------------------------
+
+    def _build(self, lr_schedule: Schedule) -> None:
+        super()._build(lr_schedule)
+        given = self._mpc_arguments
+        space = self.action_space
+        assert isinstance(space, spaces.Box)
+        low, high = (np.asarray(bound, dtype=np.float64).ravel() for bound in (space.low, space.high))
+        lcs = _make_lcs(self._sizes, given, low, high)
+        self.action_net = LcsMpc(
+            lcs, given["reward"], low, high, given["horizon"], given["terminal_value"], given["penalty"],
+            given["smoothing"], given["n_iterations"], given["solver"],
+        )  # fmt: skip
+        scale_is_known = given["state_scale"] is not None or given["initial_lcs"] is not None
+        self.register_buffer("_scale_is_set", torch.tensor(scale_is_known))
+        if self.mpc.terminal_value.needs_quadratic_critic:
+            self.value_net = QuadraticCritic(lcs.state_scale)
+        if given["log_std_init"] is None:
+            log_std = torch.log(_INITIAL_NOISE * lcs.action_scale).float()
+        else:
+            log_std = torch.full((self._sizes[1],), float(given["log_std_init"]))
+        with torch.no_grad():
+            self.log_std.copy_(log_std)
+
+        self.store = TransitionStore(*self._sizes)
+        self._loss_data: tuple[torch.Tensor, ...] | None = None
+        self._losses: list[float] = []
+        self.optimizer = self.optimizer_class(self.parameters(), lr=lr_schedule(1), **self.optimizer_kwargs)  # type: ignore[call-arg]
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        data = super()._get_constructor_parameters()
+        for name in (
+            "squash_output",
+            "full_std",
+            "use_expln",
+        ):  # belong to gSDE, which this policy does not have
+            data.pop(name, None)
+        return data | self._mpc_arguments
+
+    def get_extra_state(self) -> torch.Tensor:
+        """The transitions seen, saved with the weights."""
+        return torch.as_tensor(self.store.rows())
+
+    def set_extra_state(self, state: torch.Tensor) -> None:
+        self.store.restore(state.cpu().numpy())
+
+    # -- public -------------------------------------------------------------------------------------------------
+
+    @property
+    def mpc(self) -> LcsMpc:
+        """The controller."""
+        controller = self.action_net
+        assert isinstance(controller, LcsMpc)
+        return controller
+
+    @property
+    def lcs(self) -> LinearComplementaritySystem:
+        """The learned model."""
+        return self.mpc.lcs
+
+    def plan(self, observation: np.ndarray, previous: MpcPlan | None = None) -> MpcPlan:
+        """The plan behind the action.
+
+        :param observation: (N, n_x) or (n_x,)
+        :param previous: the plan made one step earlier, see :meth:`LcsMpc.plan`
+        """
+        return self.mpc.plan(np.asarray(observation, dtype=np.float64), previous)
+
+    def evaluate_actions(
+        self, obs: PyTorchObs, actions: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor | None]:
+        """As in the base class; a backward pass through the log-probabilities adds ``alpha L_pred`` (eq 16).
+
+        :raise RuntimeError: while training, where no transitions have been handed over
+        """
+        if not torch.is_grad_enabled():
+            return super().evaluate_actions(obs, actions)
+        if self._loss_data is None:
+            raise RuntimeError(
+                "MpcLcsPolicy has no transitions to learn its model from. PPO and A2C record them once "
+                "sb3_mpc_policy is imported; any other algorithm needs callback=PredictionLossCallback() in learn()"
+            )
+        if self._mpc_arguments["policy_gradient"]:
+            values, log_prob, entropy = super().evaluate_actions(obs, actions)
+        else:
+            self.lcs.requires_grad_(False)
+            try:
+                values, log_prob, entropy = super().evaluate_actions(obs, actions)
+            finally:
+                self.lcs.requires_grad_(True)
+        loss = self.prediction_loss()
+        self._losses.append(loss.item())
+        return values, add_to_backward(log_prob, self._mpc_arguments["prediction_coef"] * loss), entropy
+
+    def prediction_loss(self) -> torch.Tensor:
+        """``L_pred`` on the transitions handed over last, a float64 number with gradient."""
+        assert self._loss_data is not None
+        return PREDICTION_LOSSES[self._mpc_arguments["prediction_loss"]](self.lcs, *self._loss_data)
+
+    # -- what the callback drives -------------------------------------------------------------------------------
+
+    def prepare_update(self) -> None:
+        """A rollout ended: choose the transitions that the coming update's prediction loss is taken over."""
+        data = self.store.everything() if self._mpc_arguments["replay"] else self.store.rollout()
+        deviation = step_deviation(data.s, data.s_next)
+        if len(data.s) > _LARGEST_LOSS_BATCH:
+            data = data.take(torch.randperm(len(data.s))[:_LARGEST_LOSS_BATCH].numpy())
+        arrays = (data.s, data.a, data.s_next, deviation)
+        self._loss_data = tuple(torch.as_tensor(array, device=self.device) for array in arrays)
+        self._losses.clear()
+
+    def end_update(self, reward_scale: float = 1.0) -> dict[str, float]:
+        """An update ended: fit what is not left to the gradient, and bring the controller up to date.
+
+        :param reward_scale: what the rewards that the critic saw were divided by
+        :return: what there is to log
+        """
+        log: dict[str, float] = {}
+        if len(self.store):
+            if not self._scale_is_set:
+                self._set_scale()
+            data = self.store.everything() if self._mpc_arguments["replay"] else self.store.rollout()
+            if self._mpc_arguments["reward"] is None:
+                scales = self.lcs.state_scale.cpu().numpy(), self.lcs.action_scale.cpu().numpy()
+                cost, log["train/reward_loss"] = fit_cost(data.s, data.a, data.reward, *scales)
+                self.mpc.set_cost(cost)
+            if self._mpc_arguments["model_fit"] == "least_squares":
+                log["train/model_fit_error"] = fit_tangent(self.lcs, data, self.mpc.target())
+        if self._losses:
+            log["train/prediction_loss"] = float(np.mean(self._losses))
+        critic = self.value_net if isinstance(self.value_net, QuadraticCritic) else None
+        self.mpc.refresh(critic, reward_scale)
+        return log | self._controller_log()
+
+    def _set_scale(self) -> None:
+        """Freeze the state scale: the spread of the first rollout."""
+        spread = self.store.everything().s.std(axis=0)
+        scale = np.maximum(spread, 1e-3 * max(float(spread.max()), 1e-6))
+        self.lcs.set_scales(scale)
+        if isinstance(self.value_net, QuadraticCritic):
+            self.value_net.state_scale.copy_(torch.as_tensor(scale))
+        self._scale_is_set.fill_(True)
+
+    def _controller_log(self) -> dict[str, float]:
+        counts = self.mpc.statistics
+        self.mpc.statistics = ControllerStatistics()
+        if not counts.plans:
+            return {}
+        return {
+            "mpc/solve_time_ms": 1e3 * counts.seconds / counts.plans,
+            "mpc/failed_share": counts.failed / counts.plans,
+            "mpc/contact_share": counts.in_contact / counts.plans,
+            "mpc/complementarity": counts.complementarity,
+        }
+
+
+def _check_spaces(observation_space: spaces.Space, action_space: spaces.Space) -> tuple[int, int]:
+    for name, space in (("observation_space", observation_space), ("action_space", action_space)):
+        if not isinstance(space, spaces.Box) or len(space.shape) != 1 or not np.issubdtype(space.dtype, np.floating):
+            raise ValueError(
+                f"{name} must be a one-dimensional Box of floats: MpcLcsPolicy models state and action as vectors; "
+                f"got {space}"
+            )
+    return observation_space.shape[0], action_space.shape[0]  # type: ignore[index]
+
+
+def _critic_layers(net_arch: list[int] | dict[str, list[int]] | None, terminal_value: str) -> list[int]:
+    if TERMINAL_VALUES[terminal_value].needs_quadratic_critic:
+        if net_arch not in (None, [], {}, dict(pi=[], vf=[])):
+            raise ValueError(
+                f"net_arch must be None with terminal_value={terminal_value!r}, whose critic is a quadratic; "
+                f"got {net_arch!r}"
+            )
+        return []
+    if net_arch is None:
+        return [64, 64]
+    if isinstance(net_arch, dict):
+        if net_arch.get("pi"):
+            raise ValueError(
+                f"net_arch must not have layers for pi: the policy's mean is a controller, got {net_arch!r}"
+            )
+        return list(net_arch.get("vf", []))
+    return list(net_arch)
+
+
+def _make_lcs(
+    sizes: tuple[int, int], given: dict[str, Any], low: np.ndarray, high: np.ndarray
+) -> LinearComplementaritySystem:
+    n_states, n_actions = sizes
+    initial: LinearComplementaritySystem | None = given["initial_lcs"]
+    if initial is not None:
+        if (initial.n_states, initial.n_actions) != sizes:
+            raise ValueError(
+                f"initial_lcs must have {n_states} states and {n_actions} actions, "
+                f"got {initial.n_states} and {initial.n_actions}"
+            )
+        return copy.deepcopy(initial)
+    half_range = np.where(np.isfinite(high - low), (high - low) / 2, 1.0)
+    action_scale = half_range if given["action_scale"] is None else given["action_scale"]
+    return LinearComplementaritySystem(n_states, n_actions, given["n_contacts"], given["state_scale"], action_scale)
