@@ -83,9 +83,7 @@ def table_of(scores: Mapping[str, float]) -> Table:
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the demo from the command line."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--env", default="CartPoleSoftWalls-v0", metavar="ID")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--steps", type=int, default=2_000, help="environment steps of training")
@@ -122,12 +120,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     scores = {**references, "learned": evaluations[-1].score}
     model.save(args.output / "mpc.zip")
     write_scores(args.output / "scores.csv", scores)
-    plots.learning_curve(
-        args.output / "learning_curve.png", evaluations, references, f"{args.env}, seed {args.seed}"
-    )
-    plots.rollout_animation(
-        args.output / "rollout.gif", args.env, planner(policy), liveliest_episode(args.env)
-    )
+    plots.learning_curve(args.output / "learning_curve.png", evaluations, references, f"{args.env}, seed {args.seed}")
+    plots.rollout_animation(args.output / "rollout.gif", args.env, planner(policy), liveliest_episode(args.env))
 
     console.print(table_of(scores))
     first = evaluation.solved(evaluations, references["oracle"])

@@ -189,9 +189,7 @@ class EvaluationCallback(BaseCallback):
         seconds = begun - self._started - self._spent
         with random_state_kept():
             score = self.evaluator.score(controller_of(self.model))
-        self.evaluations.append(
-            Evaluation(self.num_timesteps, self._finished + self._under_way, seconds, score)
-        )
+        self.evaluations.append(Evaluation(self.num_timesteps, self._finished + self._under_way, seconds, score))
         if self.on_evaluation is not None:
             self.on_evaluation(self.evaluations[-1])
         self._spent += time.perf_counter() - begun

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from joblib import Parallel, delayed, parallel_config
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
@@ -63,12 +64,13 @@ def verdicts(rows: Sequence[Row]) -> dict[tuple[str, str, int], Verdict]:
 def summary(rows: Sequence[Row]) -> Table:
     """A table of the runs in one environment: a line each, and one with medians for each variant.
 
-    A run that is not solved counts as later than every one that is; a median among those is shown as a dash.
+    "worst" is the lowest evaluation after the one that solved the run. A run that is not solved counts as
+    later than every one that is; a median among those is shown as a dash.
     """
-    table = Table(title=f"{rows[0].env}: until 95 % of the oracle's {rows[0].oracle:,.0f}, and after")
-    table.add_column("variant")
-    for name in ("seed", "solved", "rollouts", "steps", "seconds", "held", "final", "worst after"):
-        table.add_column(name, justify="right")
+    table = Table(title=f"{rows[0].env}: until 95 % of the oracle's {rows[0].oracle:,.0f}, and after", box=SIMPLE_HEAD)
+    table.add_column("variant", min_width=7, overflow="fold")
+    for name in ("seed", "solved", "rollouts", "steps", "seconds", "held", "final", "worst"):
+        table.add_column(name, justify="right", no_wrap=True)
 
     for variant, group in itertools.groupby(verdicts(rows).items(), key=lambda item: item[0][1]):
         judged = {seed: judgement for (_, _, seed), judgement in group}
@@ -122,9 +124,7 @@ def learn(
 def arguments(argv: Sequence[str] | None = None) -> argparse.Namespace:
     """The command line."""
     variants = runs.named_variants()
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument(
         "--env", nargs="+", default=["CartPoleSoftWalls-v0", "CartPoleSoftWallsPyBullet-v0"], metavar="ID"
     )
@@ -150,8 +150,7 @@ def main(argv: Sequence[str] | None = None) -> list[Row]:
     console = Console()
     label = "".join(f" {change}" for change in args.set)
     variants = {
-        name + label: runs.changed(runs.named_variants()[name], runs.parsed_changes(args.set))
-        for name in args.variant
+        name + label: runs.changed(runs.named_variants()[name], runs.parsed_changes(args.set)) for name in args.variant
     }
 
     oracles = {}
@@ -162,9 +161,7 @@ def main(argv: Sequence[str] | None = None) -> list[Row]:
 
     todo = list(itertools.product(args.env, variants, args.seeds))
     tasks = (
-        delayed(learn)(
-            env_id, name, variants[name], seed, args.steps, args.eval_every, args.episodes, oracles[env_id]
-        )
+        delayed(learn)(env_id, name, variants[name], seed, args.steps, args.eval_every, args.episodes, oracles[env_id])
         for env_id, name, seed in todo
     )
     columns = (TextColumn("training"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())

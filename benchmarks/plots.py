@@ -21,9 +21,7 @@ REFERENCES = {"oracle": ("#c8553d", "-"), "LQR": ("#e0a458", "--"), "untrained":
 """Colour and line of each reference."""
 
 
-def learning_curve(
-    path: Path, evaluations: Sequence[Evaluation], references: Mapping[str, float], title: str
-) -> None:
+def learning_curve(path: Path, evaluations: Sequence[Evaluation], references: Mapping[str, float], title: str) -> None:
     """Draw the score against training rollouts and against environment steps.
 
     Scores far below zero, as a fallen pole's can be, are drawn on the lower edge as triangles.
@@ -52,20 +50,14 @@ def learning_curve(
         figure.savefig(path)
 
 
-def _curve(
-    axes: Axes, x: np.ndarray, scores: np.ndarray, references: Mapping[str, float], low: float
-) -> None:
+def _curve(axes: Axes, x: np.ndarray, scores: np.ndarray, references: Mapping[str, float], low: float) -> None:
     oracle = references["oracle"]
     label = f"at least {SOLVED:.0%} of the oracle"
-    axes.axhspan(
-        SOLVED * oracle, oracle, color=REFERENCES["oracle"][0], alpha=0.12, linewidth=0.0, label=label
-    )
+    axes.axhspan(SOLVED * oracle, oracle, color=REFERENCES["oracle"][0], alpha=0.12, linewidth=0.0, label=label)
     for name, score in references.items():
         colour, line = REFERENCES[name]
         axes.axhline(score, color=colour, linestyle=line, linewidth=1.4, label=f"{name} {score:,.0f}")
-    axes.plot(
-        x, np.maximum(scores, low), color=LEARNED, linewidth=2.0, marker="o", markersize=4, label="PPO + MPC"
-    )
+    axes.plot(x, np.maximum(scores, low), color=LEARNED, linewidth=2.0, marker="o", markersize=4, label="PPO + MPC")
     off = scores < low
     if off.any():
         axes.plot(x[off], np.full(off.sum(), low), "v", color=LEARNED, markersize=8, clip_on=False)

@@ -40,9 +40,7 @@ def write_rows(path: Path, rows: Iterable[Row]) -> None:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(Row._fields)
         for row in sorted(rows):
-            tidy = row._replace(
-                seconds=round(row.seconds, 2), score=round(row.score, 2), oracle=round(row.oracle, 2)
-            )
+            tidy = row._replace(seconds=round(row.seconds, 2), score=round(row.score, 2), oracle=round(row.oracle, 2))
             writer.writerow(tidy)
 
 
@@ -93,9 +91,7 @@ def changed(settings: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str
     result = dict(settings)
     for key, value in changes.items():
         old = result.get(key)
-        result[key] = (
-            changed(old, value) if isinstance(old, Mapping) and isinstance(value, Mapping) else value
-        )
+        result[key] = changed(old, value) if isinstance(old, Mapping) and isinstance(value, Mapping) else value
     return result
 
 

@@ -28,6 +28,4 @@ def test_every_data_file_beside_the_sources_is_installed() -> None:
         for name in names:
             left_by_tools = any(part == "__pycache__" or part.startswith(".") for part in name.parts)
             if name.suffix != ".py" and not left_by_tools:
-                assert any(name.match(pattern) for pattern in patterns), (
-                    f"{package}: {name} is not in setup.cfg"
-                )
+                assert any(name.match(pattern) for pattern in patterns), f"{package}: {name} is not in setup.cfg"

@@ -36,9 +36,7 @@ def test_the_animated_episode_is_one_of_the_scored_ones() -> None:
     assert demo.liveliest_episode(ENV_ID) in RESET_SEEDS
 
 
-@pytest.mark.parametrize(
-    "scores", [[700, 5_700, 5_750], [-9_000, -40_000, 5_000]], ids=["good", "off the scale"]
-)
+@pytest.mark.parametrize("scores", [[700, 5_700, 5_750], [-9_000, -40_000, 5_000]], ids=["good", "off the scale"])
 def test_learning_curve_fills_its_picture(tmp_path: Path, scores: list[float]) -> None:
     """Both panels have room: the darkest columns, the two vertical axes, are half a picture apart."""
     evaluations = [Evaluation(128 * i, i, 1.0, score) for i, score in enumerate(scores)]

@@ -18,9 +18,7 @@ def rows(variant: str, seed: int, *scores: float) -> list[Row]:
 
 
 def test_assignments_become_nested_settings() -> None:
-    changes = runs.parsed_changes(
-        ["learning_rate=1e-3", "policy_kwargs.horizon=20", "policy_kwargs.solver=daqp"]
-    )
+    changes = runs.parsed_changes(["learning_rate=1e-3", "policy_kwargs.horizon=20", "policy_kwargs.solver=daqp"])
     assert changes == {"learning_rate": 1e-3, "policy_kwargs": {"horizon": 20, "solver": "daqp"}}
 
 
@@ -58,9 +56,7 @@ def test_a_result_file_reads_back_as_it_was_written(tmp_path: Path) -> None:
 
 
 def test_verdicts_judge_each_run_by_itself() -> None:
-    verdicts = learn.verdicts(
-        rows("a", 0, 0, 960, 940, 910) + rows("a", 1, 990, 100, 990) + rows("b", 0, 0, 500)
-    )
+    verdicts = learn.verdicts(rows("a", 0, 0, 960, 940, 910) + rows("a", 1, 990, 100, 990) + rows("b", 0, 0, 500))
     assert verdicts[ENV_ID, "a", 0] == learn.Verdict(3, 128, 0.5, True, 910, 910)
     assert verdicts[ENV_ID, "a", 1] == learn.Verdict(0, 0, 0.0, False, 990, 100)
     assert verdicts[ENV_ID, "b", 0] == learn.Verdict(None, None, None, False, 500, None)
