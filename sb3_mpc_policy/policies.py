@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import copy
-from typing import Any
+import warnings
+from collections.abc import Mapping
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -12,6 +14,7 @@ from numpy.typing import ArrayLike
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
+from stable_baselines3.common.utils import get_device
 from torch import nn
 
 from sb3_mpc_policy.lcs import LinearComplementaritySystem
@@ -174,6 +177,45 @@ class MpcLcsPolicy(ActorCriticPolicy):
         ):  # belong to gSDE, which this policy does not have
             data.pop(name, None)
         return data | self._mpc_arguments
+
+    @classmethod
+    def load(cls, path: str, device: torch.device | str = "auto") -> Self:
+        """As in the base class.
+
+        :raise ValueError: for a file that another policy class saved
+        """
+        device = get_device(device)
+        saved = torch.load(path, map_location=device, weights_only=False)
+        unknown = {"horizon", "n_contacts"} - set(saved["data"])
+        if unknown:
+            raise ValueError(
+                f"{path} must be a file saved by {cls.__name__}; another policy class, such as MlpPolicy, saved this "
+                f"one: it lacks {sorted(unknown)} and has {sorted(saved['data'])}"
+            )
+        policy = cls(**saved["data"])
+        policy.load_state_dict(saved["state_dict"])
+        policy.to(device)
+        return policy
+
+    def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
+        """As in the base class.
+
+        :raise ValueError: where all of the state is asked for, and it is that of another policy class
+        """
+        if strict and "action_net.lcs.A_scaled" not in state_dict:
+            raise ValueError(
+                f"state_dict must be that of an {type(self).__name__}; this one has no learned model, so it is from "
+                f"another policy class, such as MlpPolicy: it has {sorted(state_dict)}"
+            )
+        return super().load_state_dict(state_dict, strict, assign)
+
+    @torch.no_grad()
+    def load_from_vector(self, vector: np.ndarray) -> None:
+        """As in the base class, which would turn the model's float64 into float32."""
+        flat = torch.as_tensor(vector, device=self.device)
+        parts = flat.split([parameter.numel() for parameter in self.parameters()])
+        for parameter, part in zip(self.parameters(), parts, strict=True):
+            parameter.copy_(part.view_as(parameter))
 
     def get_extra_state(self) -> torch.Tensor:
         """The transitions seen, saved with the weights."""
