@@ -27,13 +27,17 @@ class PredictionLossCallback(BaseCallback):
         self.policy = policy
         self._normalize = self.model.get_vec_normalize_env()
         check_observations(self._normalize)
+        self._in_rollout = False
 
     def _on_rollout_start(self) -> None:
         """The update on the last rollout is over: fit the model to all that is known, then plan with it."""
         self._end_update()
         self.policy.store.start_rollout()
+        self._in_rollout = True
 
     def _on_step(self) -> bool:
+        if not self._in_rollout:  # inside an EventCallback, which passes on some steps and no rollouts
+            return True
         infos, dones = self.locals["infos"], self.locals["dones"]
         # at this point of collect_rollouts _last_obs still is the observation the action was chosen for
         s_next = np.array(self.locals["new_obs"], dtype=np.float64)

@@ -21,7 +21,7 @@ from sb3_mpc_policy.lcs import LinearComplementaritySystem
 from sb3_mpc_policy.model_fit import MODEL_FITS, fit_tangent
 from sb3_mpc_policy.mpc import ControllerStatistics, LcsMpc, MpcPlan
 from sb3_mpc_policy.prediction import PREDICTION_LOSSES, add_to_backward, step_deviation
-from sb3_mpc_policy.reward import QuadraticReward, fit_cost
+from sb3_mpc_policy.reward import QuadraticReward, fit_cost, is_flat
 from sb3_mpc_policy.terminal_value import TERMINAL_VALUES, QuadraticCritic
 from sb3_mpc_policy.transitions import TransitionStore
 
@@ -61,7 +61,7 @@ class MpcLcsPolicy(ActorCriticPolicy):
     :param replay: True to learn from all transitions so far, False from the current rollout alone (the paper's D_k)
     :param state_scale: (n_x,) size of each state; from the first rollout where None
     :param action_scale: (n_a,); half the range of a bounded action, else one, where None
-    :param initial_lcs: start from this model (copied)
+    :param initial_lcs: start from this model (copied); n_contacts and the scales are then those of the model
     :param kwargs: further arguments of ``ActorCriticPolicy``
     :raise ValueError: for spaces or arguments that the controller has no use for; the message says which
     """
@@ -166,6 +166,7 @@ class MpcLcsPolicy(ActorCriticPolicy):
         self.store = TransitionStore(*self._sizes)
         self._loss_data: tuple[torch.Tensor, ...] | None = None
         self._losses: list[float] = []
+        self._warned_of_flat_reward = False
         self.optimizer = self.optimizer_class(self.parameters(), lr=lr_schedule(1), **self.optimizer_kwargs)  # type: ignore[call-arg]
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
@@ -176,6 +177,7 @@ class MpcLcsPolicy(ActorCriticPolicy):
             "use_expln",
         ):  # belong to gSDE, which this policy does not have
             data.pop(name, None)
+        data["share_features_extractor"] = self.share_features_extractor
         return data | self._mpc_arguments
 
     @classmethod
@@ -255,11 +257,6 @@ class MpcLcsPolicy(ActorCriticPolicy):
         """
         if not torch.is_grad_enabled():
             return super().evaluate_actions(obs, actions)
-        if self._loss_data is None:
-            raise RuntimeError(
-                "MpcLcsPolicy has no transitions to learn its model from. PPO and A2C record them once "
-                "sb3_mpc_policy is imported; any other algorithm needs callback=PredictionLossCallback() in learn()"
-            )
         if self._mpc_arguments["policy_gradient"]:
             values, log_prob, entropy = super().evaluate_actions(obs, actions)
         else:
@@ -273,14 +270,24 @@ class MpcLcsPolicy(ActorCriticPolicy):
         return values, add_to_backward(log_prob, self._mpc_arguments["prediction_coef"] * loss), entropy
 
     def prediction_loss(self) -> torch.Tensor:
-        """``L_pred`` on the transitions handed over last, a float64 number with gradient."""
-        assert self._loss_data is not None
+        """``L_pred`` on the transitions of the update in progress, a float64 number with gradient.
+
+        :raise RuntimeError: where no transitions have been handed over for this update
+        """
+        if self._loss_data is None:
+            raise RuntimeError(
+                "MpcLcsPolicy has no transitions to learn its model from. PPO and A2C record them in learn() once "
+                "sb3_mpc_policy is imported; any other algorithm needs callback=PredictionLossCallback() in learn(), "
+                "and a training loop of one's own must drive that callback"
+            )
         return PREDICTION_LOSSES[self._mpc_arguments["prediction_loss"]](self.lcs, *self._loss_data)
 
     # -- what the callback drives -------------------------------------------------------------------------------
 
     def prepare_update(self) -> None:
         """A rollout ended: choose the transitions that the coming update's prediction loss is taken over."""
+        if not self._scale_is_set:
+            self._set_scale()
         data = self.store.everything() if self._mpc_arguments["replay"] else self.store.rollout()
         deviation = step_deviation(data.s, data.s_next)
         if len(data.s) > _LARGEST_LOSS_BATCH:
@@ -296,30 +303,46 @@ class MpcLcsPolicy(ActorCriticPolicy):
         :return: what there is to log
         """
         log: dict[str, float] = {}
-        if len(self.store):
-            if not self._scale_is_set:
-                self._set_scale()
-            data = self.store.everything() if self._mpc_arguments["replay"] else self.store.rollout()
+        data = self.store.everything() if self._mpc_arguments["replay"] else self.store.rollout()
+        if len(data.s):  # none before the first rollout, nor, without replay, after loading
             if self._mpc_arguments["reward"] is None:
                 scales = self.lcs.state_scale.cpu().numpy(), self.lcs.action_scale.cpu().numpy()
+                if is_flat(data.reward):
+                    self._warn_of_flat_reward()
                 cost, log["train/reward_loss"] = fit_cost(data.s, data.a, data.reward, *scales)
                 self.mpc.set_cost(cost)
             if self._mpc_arguments["model_fit"] == "least_squares":
                 log["train/model_fit_error"] = fit_tangent(self.lcs, data, self.mpc.target())
         if self._losses:
             log["train/prediction_loss"] = float(np.mean(self._losses))
+        self._loss_data = None  # the next update needs its own
         critic = self.value_net if isinstance(self.value_net, QuadraticCritic) else None
         self.mpc.refresh(critic, reward_scale)
         return log | self._controller_log()
 
     def _set_scale(self) -> None:
-        """Freeze the state scale: the spread of the first rollout."""
+        """Freeze the state scale, the spread of the first rollout, before anything is learned in its units."""
         spread = self.store.everything().s.std(axis=0)
+        if not spread.any():
+            return  # a single state: there will be more
         scale = np.maximum(spread, 1e-3 * max(float(spread.max()), 1e-6))
         self.lcs.set_scales(scale)
         if isinstance(self.value_net, QuadraticCritic):
             self.value_net.state_scale.copy_(torch.as_tensor(scale))
         self._scale_is_set.fill_(True)
+        self.mpc.refresh()
+
+    def _warn_of_flat_reward(self) -> None:
+        """Once, and not after every rollout."""
+        if not self._warned_of_flat_reward:
+            self._warned_of_flat_reward = True
+            warnings.warn(
+                "The observed reward is flat, so no cost can be learned from it, and the controller only stays near "
+                "the origin. Say what to control with policy_kwargs=dict(reward=QuadraticReward(state_weight, "
+                "action_weight, target)).",
+                UserWarning,
+                stacklevel=2,
+            )
 
     def _controller_log(self) -> dict[str, float]:
         counts = self.mpc.statistics
@@ -369,6 +392,11 @@ def _make_lcs(
     n_states, n_actions = sizes
     initial: LinearComplementaritySystem | None = given["initial_lcs"]
     if initial is not None:
+        if not isinstance(initial, LinearComplementaritySystem):
+            raise TypeError(f"initial_lcs must be a LinearComplementaritySystem or None, got {initial!r}")
+        for name in ("state_scale", "action_scale"):
+            if given[name] is not None:
+                raise ValueError(f"{name} must be None with initial_lcs, which has its own, got {given[name]!r}")
         if (initial.n_states, initial.n_actions) != sizes:
             raise ValueError(
                 f"initial_lcs must have {n_states} states and {n_actions} actions, "

@@ -6,7 +6,7 @@ A run with any other policy takes the very same path through the library as with
 from __future__ import annotations
 
 from stable_baselines3 import A2C, PPO
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ConvertCallback, EventCallback
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ConvertCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.type_aliases import MaybeCallback
 
@@ -40,9 +40,8 @@ def _init_callback(self: OnPolicyAlgorithm, callback: MaybeCallback, progress_ba
     return OnPolicyAlgorithm._init_callback(self, callback, progress_bar)
 
 
-def _contains_hook(callback: BaseCallback | None) -> bool:
+def _contains_hook(callback: BaseCallback) -> bool:
     if isinstance(callback, CallbackList):
         return any(_contains_hook(child) for child in callback.callbacks)
-    if isinstance(callback, EventCallback):
-        return _contains_hook(callback.callback)
+    # one inside an EventCallback does not count, as it is not told of rollouts and records nothing
     return isinstance(callback, PredictionLossCallback)

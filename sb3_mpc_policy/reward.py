@@ -6,7 +6,6 @@ controller's problem is convex.
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -14,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import lsq_linear
 
-__all__ = ["QuadraticCost", "QuadraticReward", "fit_cost", "flat_cost"]
+__all__ = ["QuadraticCost", "QuadraticReward", "fit_cost", "flat_cost", "is_flat"]
 
 # Above this many components of (s, a) only a diagonal W is fitted: a full one has their square of parameters.
 _LARGEST_FULL_FIT = 32
@@ -104,6 +103,11 @@ def flat_cost(state_scale: np.ndarray, action_scale: np.ndarray) -> QuadraticCos
     return QuadraticCost(np.diag(1.0 / scale**2), np.zeros(len(scale)), 0.0)
 
 
+def is_flat(reward: np.ndarray) -> bool:
+    """Whether the rewards (N,) are all the same up to rounding, so that nothing can be learned from them."""
+    return float(reward.std()) <= 1e-8 * max(1.0, abs(float(reward.mean())))
+
+
 def fit_cost(
     s: np.ndarray, a: np.ndarray, reward: np.ndarray, state_scale: np.ndarray, action_scale: np.ndarray
 ) -> tuple[QuadraticCost, float]:
@@ -117,18 +121,12 @@ def fit_cost(
     :param reward: (N,)
     :param state_scale: (n_x,), for conditioning
     :param action_scale: (n_a,)
-    :return: the cost, and the mean squared error relative to the variance of the reward (0 is a perfect fit)
+    :return: the cost, and the mean squared error relative to the variance of the reward (0 is a perfect fit); for a
+        flat reward :func:`flat_cost` and 1
     """
     scale = np.concatenate([state_scale, action_scale])
     centre, spread = float(reward.mean()), float(reward.std())
-    if spread <= 1e-8 * max(1.0, abs(centre)):
-        warnings.warn(
-            "The observed reward is flat, so no cost can be learned from it, and the controller only stays near the "
-            "origin. Say what to control with policy_kwargs=dict(reward=QuadraticReward(state_weight, action_weight, "
-            "target)).",
-            UserWarning,
-            stacklevel=2,
-        )
+    if is_flat(reward):
         return flat_cost(state_scale, action_scale), 1.0
     z = np.concatenate([s, a], axis=1) / scale
     y = -(reward - centre) / spread
