@@ -156,14 +156,19 @@ class LinearComplementaritySystem(nn.Module):
 
     @torch.no_grad()
     def _assign(self, given: LcsMatrices[np.ndarray]) -> None:
-        """Take over matrices in environment units; choose force and gap scales that make F's diagonal one."""
+        """Take over matrices in environment units; choose force and gap scales that make F's diagonal one.
+
+        All contacts share the unit of force times gap: only such scales keep F's symmetric part positive definite. Its
+        size makes the gaps of order one.
+        """
         s, a = self.state_scale.cpu().numpy(), self.action_scale.cpu().numpy()
-        gap = np.linalg.norm(np.hstack([given.D * s, given.E * a]), axis=1)
-        gap[gap == 0.0] = 1.0
+        size = np.linalg.norm(np.hstack([given.D * s, given.E * a]), axis=1)
+        size[size == 0.0] = 1.0
         diagonal = np.diag(given.F)
         if (diagonal <= 0).any():
             raise ValueError(f"F must have a positive definite symmetric part, got the diagonal {diagonal}")
-        force = gap / diagonal
+        product = np.exp(np.mean(np.log(size**2 / diagonal))) if len(size) else 1.0
+        gap, force = np.sqrt(product * diagonal), np.sqrt(product / diagonal)
         F = given.F * force / gap[:, None]
         least = np.linalg.eigvalsh((F + F.T) / 2).min(initial=np.inf)
         if least < KAPPA:
@@ -237,6 +242,8 @@ class LinearComplementaritySystem(nn.Module):
         for name, value, size in (("s", state, self.n_states), ("a", action, self.n_actions)):
             if value.ndim not in (1, 2) or value.shape[-1] != size:
                 raise ValueError(f"{name} must have shape (N, {size}) or ({size},), got {tuple(value.shape)}")
+        if action.shape[:-1] != state.shape[:-1]:
+            raise ValueError(f"a must have as many rows as s, {tuple(state.shape[:-1])}, got {tuple(action.shape)}")
         return torch.atleast_2d(state), torch.atleast_2d(action), single
 
     def matrices(self) -> LcsMatrices[torch.Tensor]:
