@@ -43,7 +43,8 @@ def affine_lqr(A: np.ndarray, B: np.ndarray, d: np.ndarray, W: np.ndarray, w: np
     """
     for source, solve in (("riccati", _algebraic), ("finite horizon", _finite_horizon)):
         try:
-            P, p, K, k = solve(A, B, d, W, w)
+            with np.errstate(over="ignore", invalid="ignore"):  # a model that explodes is what the fallbacks are for
+                P, p, K, k = solve(A, B, d, W, w)
         except (np.linalg.LinAlgError, ValueError):  # SciPy raises either where no solution exists
             continue
         usable = all(np.isfinite(part).all() for part in (P, p, K, k))
