@@ -221,7 +221,8 @@ class LcsMpc(nn.Module):
         """The problem for the present parameters; kept while they do not change."""
         model = self._numpy_model()
         constants = [self._numpy(name) for name in ("terminal_weight", "terminal_slope", "cost_weight", "cost_slope")]
-        key = b"".join(part.tobytes() for part in (*model, *constants))
+        scales = [self._numpy(name, self.lcs) for name in ("state_scale", "action_scale")]
+        key = b"".join(part.tobytes() for part in (*model, *constants, *scales))
         if self._problem is None or key != self._problem_key:
             W, w = self._scaled_cost()
             action_scale = self._numpy("action_scale", self.lcs)
