@@ -44,7 +44,7 @@ def step_by_enumeration(model: LcsMatrices[np.ndarray], s, a, enumerate_lcp) -> 
     return A @ s + B @ a + C @ lam + d, lam
 
 
-# -- the step -----------------------------------------------------------------------------------------------------------
+# -- the step ------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("n_contacts", [0, 1, 2, 3, 6])
@@ -98,7 +98,7 @@ def test_states_and_actions_of_the_wrong_shape_are_named(random_model, s, a, nam
             method(s, a)
 
 
-# -- parameters and units -----------------------------------------------------------------------------------------------
+# -- parameters and units ------------------------------------------------------------------------------------------
 
 
 @settings(max_examples=60, deadline=None)
@@ -178,7 +178,7 @@ def test_the_scales_are_saved_and_not_learned():
     torch.testing.assert_close(other.contact_force(s, a), lcs.contact_force(s, a), rtol=0, atol=0)
 
 
-# -- the derivative -----------------------------------------------------------------------------------------------------
+# -- the derivative ------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("touching", [True, False])
@@ -232,7 +232,7 @@ def test_contact_force_is_differentiable(random_model, parameter_gradients):
         np.testing.assert_allclose(getattr(lcs, name).grad, expected[name], rtol=1e-5, atol=1e-6, err_msg=name)
 
 
-# -- trajectories -------------------------------------------------------------------------------------------------------
+# -- trajectories --------------------------------------------------------------------------------------------------
 
 
 def test_simulate_repeats_the_step(random_model):
@@ -288,7 +288,7 @@ def test_the_cart_pole_moves_as_the_integrated_equations_say(cart_pole, start):
     assert force[1 - pressed] == 0.0
 
 
-# -- errors -------------------------------------------------------------------------------------------------------------
+# -- errors --------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
