@@ -169,9 +169,7 @@ class CartPoleSoftWallsEnv(gym.Env[NDArray[np.float64], NDArray[np.float32]], Ez
         self.theta_limit = positive("theta_limit", theta_limit)
         self.x_limit = positive("x_limit", x_limit)
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
-            raise ValueError(
-                f"render_mode must be None or one of {self.metadata['render_modes']}, got {render_mode!r}"
-            )
+            raise ValueError(f"render_mode must be None or one of {self.metadata['render_modes']}, got {render_mode!r}")
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "render_fps": max(1, round(1.0 / self.control_step))}
 
@@ -284,9 +282,7 @@ class CartPoleSoftWallsEnv(gym.Env[NDArray[np.float64], NDArray[np.float32]], Ez
             self._frame_due = time.monotonic() + self.control_step
             self._simulator.show()
             return None
-        gym.logger.warn(
-            "render() without a render mode does nothing: pass render_mode='rgb_array' to gymnasium.make"
-        )
+        gym.logger.warn("render() without a render mode does nothing: pass render_mode='rgb_array' to gymnasium.make")
         return None
 
     def close(self) -> None:
@@ -335,9 +331,7 @@ def _magnitudes(name: str, values: Sequence[float]) -> NDArray[np.float64]:
 def _substeps(control_step: float, physics_step: float) -> int:
     substeps = round(control_step / physics_step)
     if substeps < 1 or not math.isclose(substeps * physics_step, control_step, rel_tol=1e-9):
-        raise ValueError(
-            f"control_step must be a multiple of physics_step, got {control_step!r} and {physics_step!r}"
-        )
+        raise ValueError(f"control_step must be a multiple of physics_step, got {control_step!r} and {physics_step!r}")
     return substeps
 
 

@@ -115,9 +115,7 @@ def wall_forces(state: ArrayLike, parameters: CartPoleParameters) -> NDArray[np.
     return parameters.wall_stiffness * np.maximum(depth, 0.0)
 
 
-def equations_of_motion(
-    state: ArrayLike, force: ArrayLike, parameters: CartPoleParameters
-) -> NDArray[np.float64]:
+def equations_of_motion(state: ArrayLike, force: ArrayLike, parameters: CartPoleParameters) -> NDArray[np.float64]:
     """Time derivative of the state.
 
     :param state: (..., 4) x (m), x_dot (m/s), theta (rad), theta_dot (rad/s)
@@ -203,13 +201,9 @@ def integrate(
         # piece of no length means a tip at rest on a wall's face: there is nothing to cut then.
         depth.direction = -1.0 if touching else 1.0  # type: ignore[attr-defined]
         events = depth if moved else None
-        piece = solve_ivp(
-            derivative, (time, duration), current, "DOP853", events=events, rtol=rtol, atol=atol
-        )
+        piece = solve_ivp(derivative, (time, duration), current, "DOP853", events=events, rtol=rtol, atol=atol)
         if not piece.success:
-            raise RuntimeError(
-                f"integration failed at {time} s from state {state!r}, force {force!r}: {piece.message}"
-            )
+            raise RuntimeError(f"integration failed at {time} s from state {state!r}, force {force!r}: {piece.message}")
         touching, moved = not touching, piece.t[-1] > time
         current, time = piece.y[:, -1], float(piece.t[-1])
     return current
@@ -249,9 +243,7 @@ def true_lcs(
         raise ValueError(f"gap_instant must be a fraction of the control step in [0, 1], got {gap_instant!r}")
 
     moment = parameters.pole_mass * parameters.mass_centre
-    mass = np.array(
-        [[parameters.cart_mass + parameters.pole_mass, moment], [moment, moment * parameters.mass_centre]]
-    )
+    mass = np.array([[parameters.cart_mass + parameters.pole_mass, moment], [moment, moment * parameters.mass_centre]])
     # Columns: theta, action, right wall, left wall. Rows: what they do to x and to theta.
     loads = np.array(
         [

@@ -94,9 +94,7 @@ class _Canvas:
     def polygon(self, points: list[Point], fill: Colour) -> None:
         self._draw.polygon([self._at(point) for point in points], fill=fill)
 
-    def box(
-        self, left: float, bottom: float, right: float, top: float, fill: Colour, corner: float = 0.0
-    ) -> None:
+    def box(self, left: float, bottom: float, right: float, top: float, fill: Colour, corner: float = 0.0) -> None:
         self._draw.rounded_rectangle(
             [self._at((left, top)), self._at((right, bottom))], radius=corner * self._scale, fill=fill
         )

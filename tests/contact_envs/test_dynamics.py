@@ -36,9 +36,7 @@ def lagrangian(q: np.ndarray, q_dot: np.ndarray, p: CartPoleParameters) -> float
 
     h = 1e-5
     velocity = (masses(q + h * q_dot) - masses(q - h * q_dot)) / (2 * h)
-    kinetic = (
-        0.5 * p.cart_mass * velocity[:2] @ velocity[:2] + 0.5 * p.pole_mass * velocity[2:] @ velocity[2:]
-    )
+    kinetic = 0.5 * p.cart_mass * velocity[:2] @ velocity[:2] + 0.5 * p.pole_mass * velocity[2:] @ velocity[2:]
     tip = q[0] + p.pole_length * np.sin(q[1])
     spring = 0.5 * p.wall_stiffness * max(abs(tip) - p.wall_distance, 0.0) ** 2
     return kinetic - p.pole_mass * p.gravity * masses(q)[3] - spring
@@ -54,8 +52,7 @@ def test_motion_obeys_lagranges_equations(parameters):
         def momentum(q, q_dot):
             return np.array(
                 [
-                    (lagrangian(q, q_dot + h * e, parameters) - lagrangian(q, q_dot - h * e, parameters))
-                    / (2 * h)
+                    (lagrangian(q, q_dot + h * e, parameters) - lagrangian(q, q_dot - h * e, parameters)) / (2 * h)
                     for e in axes
                 ]
             )
@@ -67,8 +64,7 @@ def test_motion_obeys_lagranges_equations(parameters):
         ) / (2 * t)
         generalised = np.array(
             [
-                (lagrangian(q + 1e-6 * e, q_dot, parameters) - lagrangian(q - 1e-6 * e, q_dot, parameters))
-                / 2e-6
+                (lagrangian(q + 1e-6 * e, q_dot, parameters) - lagrangian(q - 1e-6 * e, q_dot, parameters)) / 2e-6
                 for e in axes
             ]
         )

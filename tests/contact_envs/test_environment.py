@@ -196,9 +196,7 @@ def test_the_ground_truth_is_that_of_the_environments_own_parameters(engine):
     for mine, expected in zip(env.true_lcs(), true_lcs(parameters, 0.02, 20.0), strict=True):
         np.testing.assert_array_equal(mine, expected)
     state = np.array([0.4, 0.1, 0.2, 0.3])
-    np.testing.assert_array_equal(
-        env.equations_of_motion(state, 3.0), equations_of_motion(state, 3.0, parameters)
-    )
+    np.testing.assert_array_equal(env.equations_of_motion(state, 3.0), equations_of_motion(state, 3.0, parameters))
 
 
 def test_every_number_of_the_task_can_be_changed(engine):
@@ -220,9 +218,7 @@ def test_every_number_of_the_task_can_be_changed(engine):
     env.reset(options={"state": [0.29, 1.0, 0.1, -1.0]})
     _, reward, terminated, _, info = env.step(np.array([0.1], dtype=np.float32))
     np.testing.assert_allclose(info["force"], 5.0, rtol=1e-6)
-    np.testing.assert_allclose(
-        reward, -1.0 - (0.29**2 + 2.0 + 3 * 0.1**2 + 4.0) - 0.5 * info["force"] ** 2, rtol=1e-12
-    )
+    np.testing.assert_allclose(reward, -1.0 - (0.29**2 + 2.0 + 3 * 0.1**2 + 4.0) - 0.5 * info["force"] ** 2, rtol=1e-12)
     assert terminated
 
 

@@ -100,9 +100,7 @@ def test_a_plan_is_drawn_over_the_state():
 def test_extreme_states_and_other_plants_can_be_drawn():
     for state in ([50.0, 0, 3.0, 0], [-1.0, -300.0, -1.5, 1e6], [0.9, 0, 1.5, 0]):
         draw(state, force=1e4)
-    draw(
-        parameters=CartPoleParameters(pole_length=3.0, wall_distance=0.01, wall_stiffness=5.0, tip_radius=0.2)
-    )
+    draw(parameters=CartPoleParameters(pole_length=3.0, wall_distance=0.01, wall_stiffness=5.0, tip_radius=0.2))
 
 
 @pytest.mark.parametrize("plan", [np.zeros(4), np.zeros((0, 4)), np.zeros((5, 3)), np.full((5, 4), np.nan)])

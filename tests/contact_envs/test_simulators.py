@@ -129,17 +129,12 @@ def test_same_start_and_forces_give_the_same_bits_whatever_ran_before(engine):
 def test_simulators_in_one_process_do_not_disturb_each_other(engine):
     rng = np.random.default_rng(1)
     forces = rng.uniform(-10, 10, (2, 30))
-    alone = [
-        run(make(engine), case[0], f) for case, f in zip((RIGHT_IMPACT, LEFT_IMPACT), forces, strict=True)
-    ]
+    alone = [run(make(engine), case[0], f) for case, f in zip((RIGHT_IMPACT, LEFT_IMPACT), forces, strict=True)]
     together = [make(engine), make(engine)]
     for simulator, case in zip(together, (RIGHT_IMPACT, LEFT_IMPACT), strict=True):
         simulator.reset(np.array(case[0]))
     paths = np.array(
-        [
-            [np.concatenate(simulator.step(f)) for simulator, f in zip(together, fs, strict=True)]
-            for fs in forces.T
-        ]
+        [[np.concatenate(simulator.step(f)) for simulator, f in zip(together, fs, strict=True)] for fs in forces.T]
     )
     np.testing.assert_array_equal(paths.swapaxes(0, 1), alone)
     together[0].close()

@@ -42,8 +42,7 @@ def test_free_motion_is_the_derivative_of_the_integrated_step(control_step, max_
         column = (integrate(s, 0.0, control_step) - integrate(-s, 0.0, control_step)) / (2 * h)
         np.testing.assert_allclose(lcs.A[:, axis], column, atol=1e-6)
     column = (
-        integrate(np.zeros(4), h * max_force, control_step)
-        - integrate(np.zeros(4), -h * max_force, control_step)
+        integrate(np.zeros(4), h * max_force, control_step) - integrate(np.zeros(4), -h * max_force, control_step)
     ) / (2 * h)
     np.testing.assert_allclose(lcs.B[:, 0], column, atol=1e-5)
     np.testing.assert_array_equal(lcs.d, np.zeros(4))

@@ -126,9 +126,7 @@ def _build_plant(plant: MultibodyPlant, parameters: CartPoleParameters, visible:
         distance = parameters.wall_distance + parameters.tip_radius + 0.5 * WALL_THICKNESS
         block = RigidTransform([side * distance, 0.0, 0.0])
         material = _material(parameters.wall_stiffness)
-        plant.RegisterCollisionGeometry(
-            plant.world_body(), block, Box(*[WALL_THICKNESS] * 3), f"{name}_wall", material
-        )
+        plant.RegisterCollisionGeometry(plant.world_body(), block, Box(*[WALL_THICKNESS] * 3), f"{name}_wall", material)
     if visible:
         _add_looks(plant, parameters)
     plant.Finalize()
@@ -168,14 +166,10 @@ def _add_looks(plant: MultibodyPlant, parameters: CartPoleParameters) -> None:
 def _add_meshcat(builder: DiagramBuilder, scene_graph: SceneGraph) -> None:
     """A page on a local port, which Drake prints. The environment publishes by itself, hence the long
     period."""
-    MeshcatVisualizer.AddToBuilder(
-        builder, scene_graph, Meshcat(), MeshcatVisualizerParams(publish_period=1e9)
-    )
+    MeshcatVisualizer.AddToBuilder(builder, scene_graph, Meshcat(), MeshcatVisualizerParams(publish_period=1e9))
 
 
-def _add_wall_impulse(
-    builder: DiagramBuilder, plant: MultibodyPlant, physics_step: float
-) -> DiscreteTimeIntegrator:
+def _add_wall_impulse(builder: DiagramBuilder, plant: MultibodyPlant, physics_step: float) -> DiscreteTimeIntegrator:
     """Sum the contact solver's force on the tip over the physics steps, each wall apart, without leaving C++.
 
     The walls are frictionless and vertical, so the generalised contact force on x is ``left - right``, and a

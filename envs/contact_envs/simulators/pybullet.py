@@ -63,15 +63,11 @@ class PyBulletSimulator(Simulator):
         client, body = self._client, self._cart_pole
         total = [0.0, 0.0]
         for _ in range(self.substeps):
-            pybullet.setJointMotorControl2(
-                body, CART, pybullet.TORQUE_CONTROL, force=force, physicsClientId=client
-            )
+            pybullet.setJointMotorControl2(body, CART, pybullet.TORQUE_CONTROL, force=force, physicsClientId=client)
             pybullet.stepSimulation(physicsClientId=client)
             for contact in pybullet.getContactPoints(body, physicsClientId=client):
                 total[self._walls.index(contact[2])] += contact[9]
-        (x, x_dot, *_), (theta, theta_dot, *_) = pybullet.getJointStates(
-            body, (CART, POLE), physicsClientId=client
-        )
+        (x, x_dot, *_), (theta, theta_dot, *_) = pybullet.getJointStates(body, (CART, POLE), physicsClientId=client)
         return np.array([x, x_dot, theta, theta_dot]), np.array(total) / self.substeps
 
     def show(self) -> None:
@@ -111,9 +107,7 @@ def _x_display_opens() -> bool:
 
 def _add_wall(parameters: CartPoleParameters, side: float, visible: bool, client: int) -> int:
     """A fixed half-space whose face the tip's sphere touches when its centre is at the wall."""
-    shape = pybullet.createCollisionShape(
-        pybullet.GEOM_PLANE, planeNormal=[-side, 0.0, 0.0], physicsClientId=client
-    )
+    shape = pybullet.createCollisionShape(pybullet.GEOM_PLANE, planeNormal=[-side, 0.0, 0.0], physicsClientId=client)
     look = -1
     if visible:
         look = pybullet.createVisualShape(
@@ -188,9 +182,7 @@ def _add_cart_pole(parameters: CartPoleParameters, visible: bool, client: int) -
         # because PyBullet 3.2.7 forgets it when maxJointVelocity comes along.
         pybullet.changeDynamics(body, link, localInertiaDiagonal=[0.0, 0.0, 0.0], physicsClientId=client)
     for joint in (CART, POLE):  # PyBullet brakes every joint with a velocity motor unless told otherwise
-        pybullet.setJointMotorControl2(
-            body, joint, pybullet.VELOCITY_CONTROL, force=0.0, physicsClientId=client
-        )
+        pybullet.setJointMotorControl2(body, joint, pybullet.VELOCITY_CONTROL, force=0.0, physicsClientId=client)
     _make_elastic(body, POLE, parameters.wall_stiffness * TIP_STIFFNESS_RATIO, client)
     return body
 
