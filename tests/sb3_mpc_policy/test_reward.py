@@ -17,7 +17,7 @@ def symmetric(seed: int, size: int, least: float) -> np.ndarray:
     return G @ G.T + (least - np.linalg.eigvalsh(G @ G.T)[0]) * np.eye(size)
 
 
-# -- known --------------------------------------------------------------------------------------------------------------
+# -- known -------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -75,15 +75,15 @@ def test_an_impossible_reward_is_refused_where_it_is_made(arguments, message):
 
 
 def test_weights_that_do_not_fit_the_system_are_named():
-    with pytest.raises(ValueError, match="^state_weight must be for 3 states"):
+    with pytest.raises(ValueError, match=r"^state_weight must be for 3 states"):
         QuadraticReward([1.0, 1.0], 1.0).cost(3, 1)
-    with pytest.raises(ValueError, match="^action_weight must be for 3 actions"):
+    with pytest.raises(ValueError, match=r"^action_weight must be for 3 actions"):
         QuadraticReward([1.0, 1.0], [1.0, 1.0]).cost(2, 3)
-    with pytest.raises(ValueError, match="^action_weight must be for 2 actions"):
+    with pytest.raises(ValueError, match=r"^action_weight must be for 2 actions"):
         QuadraticReward([1.0, 1.0], [1.0]).cost(2, 2)
 
 
-# -- learned ------------------------------------------------------------------------------------------------------------
+# -- learned -----------------------------------------------------------------------------------------------------------
 
 
 def observations(seed: int, n: int, n_x: int, n_a: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

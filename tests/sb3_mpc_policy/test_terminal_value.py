@@ -25,7 +25,7 @@ def critic() -> QuadraticCritic:
 
 
 def test_the_choices_are_named():
-    assert TERMINAL_VALUES == {"riccati": RiccatiValue, "critic": CriticValue, "none": NoValue}
+    assert {"riccati": RiccatiValue, "critic": CriticValue, "none": NoValue} == TERMINAL_VALUES
     assert [name for name, value in TERMINAL_VALUES.items() if value.needs_quadratic_critic] == ["critic"]
 
 
@@ -86,5 +86,5 @@ def test_the_critic_can_learn_any_concave_quadratic(critic):
 
 
 def test_a_critic_value_without_critic_says_what_to_choose():
-    with pytest.raises(ValueError, match="terminal_value='critic' needs a critic.*'riccati' or 'none'"):
+    with pytest.raises(ValueError, match=r"terminal_value='critic' needs a critic.*'riccati' or 'none'"):
         CriticValue().quadratic(LQR, None, 1.0)
