@@ -37,6 +37,8 @@ __all__ = ["ControllerStatistics", "LcsMpc", "MpcPlan", "complementarity_weights
 # Relative to the mean stage weight. They keep every problem strictly convex and change no plan that matters.
 _FORCE_WEIGHT = 1e-4
 _LEAST_ACTION_WEIGHT = 1e-6
+# Change of a weight, relative to the penalty, below which a pass would repeat the one before.
+_SAME_WEIGHTS = 1e-3
 
 
 @dataclass(frozen=True)
@@ -248,27 +250,35 @@ class LcsMpc(nn.Module):
     ) -> tuple[Solution, ComplementarityWeights, np.ndarray]:
         """The best pass for each of s0 (N, n_x): its solution, its weights, and its cost under the LCS itself."""
         nominal = self._first_nominal(problem, s0, previous)
-        best: Solution | None = None
-        for _ in range(self.n_iterations):
-            weights = self._weights(problem, nominal)
-            solution = self.solver.solve(problem, s0, weights)
-            self._stand_in(problem, solution, s0)
-            nominal = simulate(problem.model, self._lcp, s0, solution.actions)
-            cost = problem.cost(nominal.states, solution.actions)
-            if best is None:
-                best, best_weights, best_cost = solution, weights, cost
-            else:
-                better = np.flatnonzero((cost < best_cost) & solution.solved)
-                best.replace(better, solution[better])
-                best_weights.gap[better], best_weights.force[better] = (
-                    weights.gap[better],
-                    weights.force[better],
-                )
-                best_cost[better] = cost[better]
-            if problem.sizes[2] == 0 or self._exact(best).all():
-                break  # without contacts, or where the relaxation is exact, another pass repeats this one
-        assert best is not None
+        weights = self._weights(problem, nominal)
+        best, best_cost, nominal = self._one_pass(problem, s0, weights)
+        best_weights = ComplementarityWeights(weights.gap.copy(), weights.force.copy())
+        todo = np.arange(len(s0))
+        for _ in range(self.n_iterations - 1):
+            following = self._weights(problem, nominal)
+            # only where the new nominal changed its contact mode does another pass solve another problem
+            changed = np.abs(following.gap - weights.gap).reshape(len(todo), -1).max(axis=1, initial=0.0)
+            again = np.flatnonzero(changed > _SAME_WEIGHTS * self._penalty(problem))
+            if not len(again):
+                break
+            todo = todo[again]
+            weights = ComplementarityWeights(following.gap[again], following.force[again])
+            solution, cost, nominal = self._one_pass(problem, s0[todo], weights)
+            better = solution.solved & (~best.solved[todo] | (cost < best_cost[todo]))
+            best.replace(todo[better], solution[better])
+            best_cost[todo[better]] = cost[better]
+            best_weights.gap[todo[better]] = weights.gap[better]
+            best_weights.force[todo[better]] = weights.force[better]
         return best, best_weights, best_cost
+
+    def _one_pass(
+        self, problem: RelaxedProblem, s0: np.ndarray, weights: ComplementarityWeights
+    ) -> tuple[Solution, np.ndarray, LcsRollout]:
+        """Solve the relaxed problem; simulate the LCS under its actions; the cost of that simulation."""
+        solution = self.solver.solve(problem, s0, weights)
+        self._stand_in(problem, solution, s0)
+        rollout = simulate(problem.model, self._lcp, s0, solution.actions)
+        return solution, problem.cost(rollout.states, solution.actions), rollout
 
     def _first_nominal(self, problem: RelaxedProblem, s0: np.ndarray, previous: np.ndarray | None) -> LcsRollout:
         bounds = (problem.action_low, problem.action_high)
@@ -281,10 +291,12 @@ class LcsMpc(nn.Module):
                 mine[better] = other[better]
         return nominal
 
+    def _penalty(self, problem: RelaxedProblem) -> float:
+        return self.penalty * _mean_weight(problem.stage_weight)
+
     def _weights(self, problem: RelaxedProblem, nominal: LcsRollout) -> ComplementarityWeights:
-        penalty = self.penalty * _mean_weight(problem.stage_weight)
         stiffness = np.diag(problem.model.F)
-        return complementarity_weights(nominal.forces, nominal.gaps, stiffness, penalty, self.smoothing)
+        return complementarity_weights(nominal.forces, nominal.gaps, stiffness, self._penalty(problem), self.smoothing)
 
     def _stand_in(self, problem: RelaxedProblem, solution: Solution, s0: np.ndarray) -> None:
         """Put the regulator's plan, simulated on the LCS, where the solver failed; a zero action if even that fails."""
@@ -300,11 +312,6 @@ class LcsMpc(nn.Module):
             safe.forces,
             safe.gaps,
         )
-
-    @staticmethod
-    def _exact(solution: Solution) -> np.ndarray:
-        """(N,) True where force and gap never are positive together."""
-        return _complementarity(solution) < 1e-9
 
     def _count(self, solution: Solution, seconds: float) -> None:
         self.statistics.seconds += seconds
