@@ -46,6 +46,7 @@ class PointMass(gym.Env[np.ndarray, np.ndarray]):
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
         (x, v), a = self.state, float(action[0])
         reward = 1.0 if self.flat_reward else 3.0 - 2.0 * x**2 - v**2 - 0.5 * a**2
+        reward = float(np.float32(reward))  # some vectorised environments pass it on in that precision
         push = 20.0 * max(0.0, -0.5 - x) - 20.0 * max(0.0, x - 0.5)
         self.state = np.array([x + 0.1 * v, v + 0.1 * x + 0.4 * a + 0.1 * push])
         self.steps += 1
@@ -66,7 +67,7 @@ class Recorder(gym.Wrapper):
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
         following, reward, terminated, truncated, info = self.env.step(action)
-        self.rows.append(np.concatenate([self.seen, action, [np.float32(reward)], following]).astype(np.float64))
+        self.rows.append(np.concatenate([self.seen, action, [reward], following]).astype(np.float64))
         self.seen = following
         return following, reward, terminated, truncated, info
 
