@@ -28,7 +28,9 @@ CONTACTS = pytest.mark.parametrize("n_contacts", [0, 1, 2, 4])
 Data = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]
 
 
-def make_model(n_contacts: int, offset: float, n_x: int = 3, n_a: int = 2, seed: int = 0) -> LinearComplementaritySystem:
+def make_model(
+    n_contacts: int, offset: float, n_x: int = 3, n_a: int = 2, seed: int = 0
+) -> LinearComplementaritySystem:
     """A random model with every parameter away from zero; ``offset`` opens (> 0) or closes (< 0) all gaps."""
     rng = np.random.default_rng(seed)
     lcs = LinearComplementaritySystem(n_x, n_a, n_contacts, rng.uniform(0.5, 2.0, n_x), rng.uniform(0.5, 2.0, n_a))

@@ -1,0 +1,134 @@
+"""The direct fit finds the tangent of the dynamics where the controller works."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from sb3_mpc_policy import LinearComplementaritySystem
+from sb3_mpc_policy.model_fit import fit_tangent
+from sb3_mpc_policy.transitions import Transitions
+
+STEP = 0.05
+
+
+def transitions(s: np.ndarray, a: np.ndarray, s_next: np.ndarray) -> Transitions:
+    return Transitions(s, a, np.zeros(len(s)), s_next)
+
+
+def smooth_part(lcs: LinearComplementaritySystem) -> list[np.ndarray]:
+    return [matrix.detach().numpy() for matrix in (lcs.A, lcs.B, lcs.d)]
+
+
+def pendulum(s: np.ndarray, a: np.ndarray) -> np.ndarray:
+    """Angle from upright, rad, and angular velocity, rad/s; semi-implicit Euler."""
+    velocity = s[:, 1] + STEP * (9.81 * np.sin(s[:, 0]) + 5.0 * a[:, 0])
+    return np.stack([s[:, 0] + STEP * velocity, velocity], axis=1)
+
+
+def pendulum_jacobian(angle: float) -> tuple[np.ndarray, np.ndarray]:
+    slope = STEP * 9.81 * np.cos(angle)
+    A = np.array([[1.0 + STEP * slope, STEP], [slope, 1.0]])
+    return A, np.array([[STEP * STEP * 5.0], [STEP * 5.0]])
+
+
+def least_squares(s: np.ndarray, a: np.ndarray, s_next: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A and B of the plain fit."""
+    features = np.hstack([s, a, np.ones((len(s), 1))])
+    theta = np.linalg.lstsq(features, s_next, rcond=None)[0].T
+    return theta[:, : s.shape[1]], theta[:, s.shape[1] : -1]
+
+
+@pytest.mark.parametrize("n_contacts", [0, 2])
+def test_a_linear_system_is_recovered_exactly_and_the_contacts_stay_as_they_are(n_contacts: int) -> None:
+    rng = np.random.default_rng(0)
+    A, B, d = rng.normal(size=(3, 3)), rng.normal(size=(3, 2)), rng.normal(size=3)
+    s, a = rng.normal(size=(300, 3)), rng.normal(size=(300, 2))
+    lcs = LinearComplementaritySystem(3, 2, n_contacts, [0.5, 2.0, 1.0], [0.3, 1.0])
+    names = ("C_scaled", "D_scaled", "E_scaled", "c_scaled", "F_factor", "F_skew")
+    before = [getattr(lcs, name).clone() for name in names]
+    residual = fit_tangent(lcs, transitions(s, a, s @ A.T + a @ B.T + d), np.zeros(3))
+    for found, truth in zip(smooth_part(lcs), (A, B, d), strict=True):
+        np.testing.assert_allclose(found, truth, atol=1e-5)
+    assert residual == pytest.approx(1e-3)  # the least it admits to
+    assert all(torch.equal(getattr(lcs, name), old) for name, old in zip(names, before, strict=True))
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.8])
+def test_the_jacobian_at_the_target_is_found_in_spite_of_curvature_and_impacts(angle: float) -> None:
+    rng = np.random.default_rng(1)
+    s = rng.uniform([-2.0, -6.0], [2.0, 6.0], (400, 2))
+    a = rng.uniform(-1.0, 1.0, (400, 1))
+    s_next = pendulum(s, a)
+    hit = rng.random(400) < 0.05
+    s_next[hit, 1] += rng.choice([-1.0, 1.0], hit.sum()) * rng.uniform(2.0, 8.0, hit.sum())
+    lcs = LinearComplementaritySystem(2, 1, 0, s.std(axis=0), [1.0])
+    fit_tangent(lcs, transitions(s, a, s_next), np.array([angle, 0.0]))
+
+    truth = pendulum_jacobian(angle)
+    errors = [np.abs(found - true).max() for found, true in zip(smooth_part(lcs)[:2], truth, strict=True)]
+    plain = [np.abs(found - true).max() for found, true in zip(least_squares(s, a, s_next), truth, strict=True)]
+    assert hit.sum() >= 10
+    assert errors[0] < 0.1 * plain[0] and errors[0] < 0.03
+    assert errors[1] < 0.2 * plain[1] and errors[1] < 0.03
+
+
+def test_the_offset_is_that_of_the_tangent_in_the_units_of_the_environment() -> None:
+    rng = np.random.default_rng(2)
+    s, a = rng.uniform([0.3, -1.0], [1.3, 1.0], (300, 2)), rng.uniform(-1.0, 1.0, (300, 1))
+    lcs = LinearComplementaritySystem(2, 1, 0, [0.4, 1.5], [0.5])
+    target = np.array([0.8, 0.0])
+    fit_tangent(lcs, transitions(s, a, pendulum(s, a)), target)
+    expected = pendulum(target[None], np.zeros((1, 1)))[0]
+    np.testing.assert_allclose(lcs.step(target, np.zeros(1)).detach().numpy(), expected, atol=2e-3)
+
+
+def test_a_target_far_outside_the_data_still_gives_a_fit_of_the_data() -> None:
+    rng = np.random.default_rng(3)
+    A, B = np.array([[1.0, 0.1], [-0.2, 0.9]]), np.array([[0.0], [0.3]])
+    s, a = rng.normal(size=(200, 2)), rng.normal(size=(200, 1))
+    lcs = LinearComplementaritySystem(2, 1)
+    fit_tangent(lcs, transitions(s, a, s @ A.T + a @ B.T), np.array([1e6, -1e6]))
+    np.testing.assert_allclose(smooth_part(lcs)[0], A, atol=1e-2)
+    np.testing.assert_allclose(smooth_part(lcs)[1], B, atol=1e-2)
+
+
+@pytest.mark.parametrize("n", [1, 2, 5])
+def test_few_transitions_give_a_finite_model_that_explains_them(n: int) -> None:
+    rng = np.random.default_rng(n)
+    s, a = rng.normal(size=(n, 2)), rng.normal(size=(n, 1))
+    s_next = pendulum(s, a)
+    lcs = LinearComplementaritySystem(2, 1)
+    assert np.isfinite(fit_tangent(lcs, transitions(s, a, s_next), np.zeros(2)))
+    for matrix in smooth_part(lcs):
+        assert np.isfinite(matrix).all() and np.abs(matrix).max() < 10.0
+    if n == 1:
+        np.testing.assert_allclose(lcs.step(s, a).detach().numpy(), s_next, atol=1e-2)
+
+
+@pytest.mark.parametrize("constant", ["a state", "the action", "everything"])
+def test_what_never_changes_gives_a_finite_model(constant: str) -> None:
+    rng = np.random.default_rng(4)
+    s, a = 0.2 * rng.normal(size=(50, 2)), rng.normal(size=(50, 1))
+    if constant in ("a state", "everything"):
+        s[:, 0] = 0.2
+    if constant in ("the action", "everything"):
+        a[:] = 0.2
+    s_next = pendulum(s, a)
+    if constant == "everything":
+        s[:] = s_next[:] = 0.2
+    lcs = LinearComplementaritySystem(2, 1)
+    assert np.isfinite(fit_tangent(lcs, transitions(s, a, s_next), np.zeros(2)))
+    assert all(np.isfinite(matrix).all() for matrix in smooth_part(lcs))
+    np.testing.assert_allclose(lcs.step(s, a).detach().numpy(), s_next, atol=0.02)
+
+
+def test_a_system_of_many_dimensions_is_fitted() -> None:
+    rng = np.random.default_rng(5)
+    A, B = np.eye(17) + 0.1 * rng.normal(size=(17, 17)), 0.1 * rng.normal(size=(17, 6))
+    s, a = rng.normal(size=(1_000, 17)), rng.normal(size=(1_000, 6))
+    lcs = LinearComplementaritySystem(17, 6, 2)
+    fit_tangent(lcs, transitions(s, a, s @ A.T + a @ B.T), np.zeros(17))
+    np.testing.assert_allclose(smooth_part(lcs)[0], A, atol=1e-2)
+    np.testing.assert_allclose(smooth_part(lcs)[1], B, atol=1e-2)
