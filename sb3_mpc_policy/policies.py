@@ -32,6 +32,13 @@ _LARGEST_LOSS_BATCH = 4096
 # Exploration at the start, as a share of the action scale.
 _INITIAL_NOISE = 0.2
 
+# How the model learns, by name; each entry can be overridden by the argument of the same name.
+PRESETS: dict[str, dict[str, Any]] = {
+    "default": {"model_fit": "least_squares", "replay": True, "prediction_loss": "prediction"},
+    # Algorithm 1 as printed: nothing but eq (16), on the current rollout D_k
+    "paper": {"model_fit": "gradient", "replay": False, "prediction_loss": "prediction"},
+}
+
 
 class MpcLcsPolicy(ActorCriticPolicy):
     """Actor-critic policy for PPO and A2C, ``a ~ N(mu(s), xi)`` with ``mu`` the first action of eq (6).
@@ -55,8 +62,10 @@ class MpcLcsPolicy(ActorCriticPolicy):
     :param n_iterations: passes of the relaxation
     :param solver: "auto", "daqp" or "cvxpylayers"
     :param prediction_coef: alpha of eq (15)
+    :param preset: "default", or "paper" for Algorithm 1 as printed; sets ``prediction_loss``, ``model_fit`` and
+        ``replay`` where they are None
     :param prediction_loss: "prediction" (eq 12) or "violation" (Jin et al. 2022)
-    :param model_fit: "least_squares" between rollouts, or "gradient" for eq (16) alone, as the paper has it
+    :param model_fit: "least_squares" between rollouts, or "gradient" for eq (16) alone
     :param policy_gradient: whether the gradient of PPO's own loss reaches the model, as in eq (16)
     :param replay: True to learn from all transitions so far, False from the current rollout alone (the paper's D_k)
     :param state_scale: (n_x,) size of each state; from the first rollout where None
@@ -86,10 +95,11 @@ class MpcLcsPolicy(ActorCriticPolicy):
         n_iterations: int = 2,
         solver: str = "auto",
         prediction_coef: float = 100.0,
-        prediction_loss: str = "prediction",
-        model_fit: str = "least_squares",
+        preset: str = "default",
+        prediction_loss: str | None = None,
+        model_fit: str | None = None,
         policy_gradient: bool = True,
-        replay: bool = True,
+        replay: bool | None = None,
         state_scale: ArrayLike | None = None,
         action_scale: ArrayLike | None = None,
         initial_lcs: LinearComplementaritySystem | None = None,
@@ -105,6 +115,11 @@ class MpcLcsPolicy(ActorCriticPolicy):
             )
         if not (np.isfinite(prediction_coef) and prediction_coef >= 0):
             raise ValueError(f"prediction_coef must be a finite number >= 0, got {prediction_coef!r}")
+        if preset not in PRESETS:
+            raise ValueError(f"preset must be one of {sorted(PRESETS)}, got {preset!r}")
+        prediction_loss = PRESETS[preset]["prediction_loss"] if prediction_loss is None else prediction_loss
+        model_fit = PRESETS[preset]["model_fit"] if model_fit is None else model_fit
+        replay = PRESETS[preset]["replay"] if replay is None else replay
         for name, value, accepted in (
             ("terminal_value", terminal_value, TERMINAL_VALUES),
             ("prediction_loss", prediction_loss, PREDICTION_LOSSES),
@@ -120,7 +135,7 @@ class MpcLcsPolicy(ActorCriticPolicy):
         self._mpc_arguments: dict[str, Any] = dict(
             horizon=horizon, n_contacts=n_contacts, reward=reward, terminal_value=terminal_value, penalty=penalty,
             smoothing=smoothing, n_iterations=n_iterations, solver=solver, prediction_coef=prediction_coef,
-            prediction_loss=prediction_loss, model_fit=model_fit, policy_gradient=policy_gradient, replay=replay,
+            preset=preset, prediction_loss=prediction_loss, model_fit=model_fit, policy_gradient=policy_gradient, replay=replay,
             state_scale=state_scale, action_scale=action_scale, initial_lcs=initial_lcs, log_std_init=log_std_init,
         )  # fmt: skip
         self._sizes = n_states, n_actions
