@@ -135,8 +135,8 @@ class MpcLcsPolicy(ActorCriticPolicy):
         self._mpc_arguments: dict[str, Any] = dict(
             horizon=horizon, n_contacts=n_contacts, reward=reward, terminal_value=terminal_value, penalty=penalty,
             smoothing=smoothing, n_iterations=n_iterations, solver=solver, prediction_coef=prediction_coef,
-            preset=preset, prediction_loss=prediction_loss, model_fit=model_fit, policy_gradient=policy_gradient, replay=replay,
-            state_scale=state_scale, action_scale=action_scale, initial_lcs=initial_lcs, log_std_init=log_std_init,
+            preset=preset, prediction_loss=prediction_loss, model_fit=model_fit, policy_gradient=policy_gradient,
+            replay=replay, state_scale=state_scale, action_scale=action_scale, initial_lcs=initial_lcs, log_std_init=log_std_init,
         )  # fmt: skip
         self._sizes = n_states, n_actions
         super().__init__(
@@ -280,6 +280,8 @@ class MpcLcsPolicy(ActorCriticPolicy):
                 values, log_prob, entropy = super().evaluate_actions(obs, actions)
             finally:
                 self.lcs.requires_grad_(True)
+        # it keeps the graph of this batch, and a policy that holds a graph cannot be copied
+        self.action_dist.distribution = None
         loss = self.prediction_loss()
         self._losses.append(loss.item())
         return values, add_to_backward(log_prob, self._mpc_arguments["prediction_coef"] * loss), entropy
@@ -322,7 +324,7 @@ class MpcLcsPolicy(ActorCriticPolicy):
         if len(data.s):  # none before the first rollout, nor, without replay, after loading
             if self._mpc_arguments["reward"] is None:
                 scales = self.lcs.state_scale.cpu().numpy(), self.lcs.action_scale.cpu().numpy()
-                if is_flat(data.reward):
+                if len(data.reward) > 1 and is_flat(data.reward):
                     self._warn_of_flat_reward()
                 cost, log["train/reward_loss"] = fit_cost(data.s, data.a, data.reward, *scales)
                 self.mpc.set_cost(cost)
