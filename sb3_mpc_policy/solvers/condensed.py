@@ -93,8 +93,8 @@ class CondensedProblem:
         """f (N, n)"""
         f = s0 @ self._slope_from_start.T + self._slope
         if self.G.size:
-            f += weights.gap.reshape(len(s0), -1) @ self.G
-            f[:, self.n_actions :] += weights.force.reshape(len(s0), -1)
+            f += weights.gap.reshape(len(s0), len(self.G)) @ self.G
+            f[:, self.n_actions :] += weights.force.reshape(len(s0), len(self.G))
         return f
 
     def gap_offset(self, s0: np.ndarray) -> np.ndarray:

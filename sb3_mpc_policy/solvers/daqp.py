@@ -72,7 +72,8 @@ class DaqpSolver(Solver):
             model = daqp.Model()
             model.settings = _ATTEMPTS[attempt]
             flag, _ = model.setup(condensed.Q, slope, condensed.G, upper, lower, guess)
-            self._models[attempt] = model
+            if flag >= 0:  # a workspace that was refused must not be updated
+                self._models[attempt] = model
         else:
             flag = model.update(f=slope, bupper=upper, blower=lower, sense=guess)
         if flag < 0:
@@ -103,7 +104,7 @@ def _guessed_active_set(condensed: CondensedProblem, weights: ComplementarityWei
 
     Without the guess the method would start where all forces are as large as the tiny ``delta`` lets them be.
     """
-    in_contact = (weights.gap > weights.force).reshape(len(weights.gap), -1)
+    in_contact = (weights.gap > weights.force).reshape(len(weights.gap), len(condensed.G))
     flags = np.zeros((len(in_contact), condensed.n + len(condensed.G)), dtype=np.intc)
     flags[:, condensed.n_actions : condensed.n] = np.where(in_contact, 0, _ACTIVE_AT_LOWER)
     flags[:, condensed.n :] = np.where(in_contact, _ACTIVE_AT_LOWER, 0)
