@@ -13,8 +13,15 @@ from sb3_mpc_policy.solvers.base import Solution, Solver
 
 __all__ = ["CvxpyLayersSolver"]
 
-# diffcp's own default, SCS, returns "Solved/Inaccurate" on these problems.
-_SOLVER_ARGS = {"solve_method": "Clarabel"}
+# diffcp's own default, SCS, returns "Solved/Inaccurate" on these problems. The quadratic cost becomes the epigraph of a
+# cone, in which an action is known to the root of the tolerance only: hence far below Clarabel's default of 1e-8.
+_TOLERANCE = 1e-12
+_SOLVER_ARGS = {
+    "solve_method": "Clarabel",
+    "tol_gap_abs": _TOLERANCE,
+    "tol_gap_rel": _TOLERANCE,
+    "tol_feas": _TOLERANCE,
+}
 # With diffcp's default LSQR the derivative is wrong by factors on these problems, whose scales are far apart.
 _DERIVATIVE_ARGS = _SOLVER_ARGS | {"mode": "dense"}
 _MODEL_PARAMETERS = ("A", "B", "C", "d", "D", "E", "F", "c")
@@ -78,12 +85,16 @@ class CvxpyLayersSolver(Solver):
             gaps=np.zeros((n, H, n_c)),
             solved=np.zeros(n, dtype=bool),
         )
-        everything = np.arange(n)
+        # what is not finite would pass through the layer as a solution that means nothing
+        finite = np.isfinite(s0).all(axis=1) & np.isfinite(weights.gap + weights.force).all(axis=(1, 2))
+        everything = np.flatnonzero(finite)
+        if not len(everything) or not all(np.isfinite(matrix).all() for matrix in problem.model):
+            return result
         try:
             self._solve_into(result, everything, problem, s0, weights)
         except (diffcp.SolverError, ValueError):
             # the layer fails as a whole where one problem fails: find out which
-            for i in everything[:, None] if n > 1 else ():
+            for i in everything[:, None] if len(everything) > 1 else ():
                 try:
                     self._solve_into(result, i, problem, s0, weights)
                 except (diffcp.SolverError, ValueError):
