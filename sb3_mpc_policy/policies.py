@@ -136,7 +136,8 @@ class MpcLcsPolicy(ActorCriticPolicy):
             horizon=horizon, n_contacts=n_contacts, reward=reward, terminal_value=terminal_value, penalty=penalty,
             smoothing=smoothing, n_iterations=n_iterations, solver=solver, prediction_coef=prediction_coef,
             preset=preset, prediction_loss=prediction_loss, model_fit=model_fit, policy_gradient=policy_gradient,
-            replay=replay, state_scale=state_scale, action_scale=action_scale, initial_lcs=initial_lcs, log_std_init=log_std_init,
+            replay=replay, state_scale=state_scale, action_scale=action_scale, initial_lcs=initial_lcs,
+            log_std_init=log_std_init,
         )  # fmt: skip
         self._sizes = n_states, n_actions
         super().__init__(
