@@ -7,7 +7,8 @@ A and B. So the fit looks for the *tangent* at the target, by robust local polyn
 * each transition counts by its distance from the target, exp(−½ |(s − target) / (2 scale)|²);
 * quadratic and cubic terms in (s, a) take part in the regression and are dropped from the result: curvature goes to
   them and not to A and B. A ridge gives them the prior of being small in scaled coordinates;
-* transitions that fit neither, contacts above all, are outliers: Cauchy weights, iteratively reweighted.
+* what the contacts of the current model explain is taken off first; transitions that still do not fit, unmodelled
+  contacts above all, are outliers: Cauchy weights, iteratively reweighted.
 
 The contact parameters C, D, E, F and c are left to the gradient of the prediction loss.
 """
@@ -39,34 +40,45 @@ _LEAST_RESIDUAL = 1e-3  # whitened: no data are trusted beyond this
 
 
 @torch.no_grad()
-def fit_tangent(lcs: LinearComplementaritySystem, data: Transitions, target: np.ndarray) -> float:
-    """Fit A, B and d of eq (5a) where the controller works.
+def fit_tangent(
+    lcs: LinearComplementaritySystem,
+    data: Transitions,
+    target: np.ndarray,
+    prior: LinearComplementaritySystem | None = None,
+) -> float:
+    """Fit A, B and d of eq (5a) where the controller works, beside the contact forces of the current C, D, E, F and c.
 
     :param lcs: changed in place
     :param data: N >= 1 transitions
     :param target: (n_x,) the state the controller tries to reach, environment units
-    :return: median whitened residual of the transitions that are not outliers
+    :param prior: model to keep to where the data say nothing; ``s' = s`` where None
+    :return: scale of the whitened residuals of the transitions that are not outliers
     """
+    n_x, n_a = lcs.n_states, lcs.n_actions
     scale, action_scale = lcs.state_scale.cpu().numpy(), lcs.action_scale.cpu().numpy()
     # a target that a learned reward puts far outside the data would leave no data to fit
     centre = np.clip(target, *np.quantile(data.s, [0.05, 0.95], axis=0)) / scale
-    x, u = data.s / scale - centre, data.a / action_scale
-    step = data.s_next / scale - data.s / scale  # so that the ridge pulls towards s' = s
-    theta, residual = _robust_regression(x, u, step)
+    x, u = data.s / scale, data.a / action_scale
+    expected_A, expected_B, expected_d = np.eye(n_x), np.zeros((n_x, n_a)), np.zeros(n_x)
+    if prior is not None:
+        known = prior.scaled()
+        expected_A, expected_B, expected_d = (part.detach().cpu().numpy() for part in (known.A, known.B, known.d))
+    push = (lcs.contact_force(data.s, data.a) / lcs.force_scale @ lcs.scaled().C.mT).detach().cpu().numpy()
+    surprise = data.s_next / scale - push - (x @ expected_A.T + u @ expected_B.T + expected_d)
+    theta, residual = _robust_regression(x - centre, u, surprise)
 
-    n_x, n_a = lcs.n_states, lcs.n_actions
     slope, offset = theta[:n_x].T, theta[n_x + n_a]
     for parameter, value in (
-        (lcs.A_scaled, slope + np.eye(n_x)),
-        (lcs.B_scaled, theta[n_x : n_x + n_a].T),
-        (lcs.d_scaled, offset - slope @ centre),
+        (lcs.A_scaled, expected_A + slope),
+        (lcs.B_scaled, expected_B + theta[n_x : n_x + n_a].T),
+        (lcs.d_scaled, expected_d + offset - slope @ centre),
     ):
         parameter.copy_(torch.as_tensor(value))
     return residual
 
 
-def _robust_regression(x: np.ndarray, u: np.ndarray, step: np.ndarray) -> tuple[np.ndarray, float]:
-    """Coefficients (n_features, n_x) of step in (x, u, 1, curvature), and the residual's scale."""
+def _robust_regression(x: np.ndarray, u: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, float]:
+    """Coefficients (n_features, n_x) of y in (x, u, 1, curvature), and the residuals' scale."""
     z = np.hstack([x, u])
     n, n_z = z.shape
     features = np.hstack([z, np.ones((n, 1)), *_curvature(z)])
@@ -74,8 +86,8 @@ def _robust_regression(x: np.ndarray, u: np.ndarray, step: np.ndarray) -> tuple[
     ridge[: n_z + 1] = _LINEAR_RIDGE
     near = np.exp(-0.5 * np.square(x / _WIDTH).sum(axis=1))
     near /= near.max()
-    deviation = _median_deviation(step)
-    whitened = step / deviation
+    deviation = _median_deviation(y)
+    whitened = y / deviation
 
     trust = np.ones(n)
     for _ in range(_REWEIGHTINGS):
@@ -100,9 +112,9 @@ def _curvature(z: np.ndarray) -> list[np.ndarray]:
     return terms
 
 
-def _median_deviation(step: np.ndarray) -> np.ndarray:
-    """(n_x,) robust standard deviation; falls back to the ordinary one, then to one, for components that rest."""
-    robust = 1.4826 * np.median(np.abs(step - np.median(step, axis=0)), axis=0)
-    ordinary = step.std(axis=0)
+def _median_deviation(y: np.ndarray) -> np.ndarray:
+    """(n_x,) robust standard deviation; falls back to the ordinary one, then to one, for constant components."""
+    robust = 1.4826 * np.median(np.abs(y - np.median(y, axis=0)), axis=0)
+    ordinary = y.std(axis=0)
     deviation = np.where(robust > 1e-3 * ordinary, robust, ordinary)
     return np.where(deviation > 1e-12, deviation, 1.0)

@@ -330,7 +330,9 @@ class MpcLcsPolicy(ActorCriticPolicy):
                 cost, log["train/reward_loss"] = fit_cost(data.s, data.a, data.reward, *scales)
                 self.mpc.set_cost(cost)
             if self._mpc_arguments["model_fit"] == "least_squares":
-                log["train/model_fit_error"] = fit_tangent(self.lcs, data, self.mpc.target())
+                log["train/model_fit_error"] = fit_tangent(
+                    self.lcs, data, self.mpc.target(), self._mpc_arguments["initial_lcs"]
+                )
         if self._losses:
             log["train/prediction_loss"] = float(np.mean(self._losses))
         self._loss_data = None  # the next update needs its own
