@@ -387,7 +387,9 @@ def test_both_solvers_agree_on_the_cart_poles_plan_and_derivative(make):
 
 
 def test_the_mean_action_is_the_first_of_the_plan_in_the_policys_dtype(make):
-    controller = make()
+    matrices = true_lcs()
+    lcs = LinearComplementaritySystem.from_matrices(*matrices, state_scale=[0.35, 1.0, 0.3, 1.0], action_scale=[7.0])
+    controller = make(lcs)
     for dtype in (torch.float32, torch.float64):
         mean = controller(torch.as_tensor(STATES, dtype=dtype))
         assert mean.dtype == dtype
@@ -469,6 +471,7 @@ def test_a_model_that_is_not_finite_still_gives_a_finite_action(make):
     assert torch.isfinite(mean).all()
     assert (mean.abs() <= 1.0).all()
     assert controller.statistics.failed == 4
+    assert np.isfinite(controller.plan(STATES).actions).all()
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])

@@ -210,6 +210,35 @@ def test_the_optimality_check_can_fail(family):
     assert kkt_residual(case.problem, case.s0, case.weights, replace(exact, actions=outside))[at_limit].min() > 1e-5
 
 
+def test_the_optimality_check_sees_a_multiplier_of_the_wrong_sign_alone():
+    """Less weight on the gaps and as much more multiplier: stationary, feasible, and not a minimum."""
+    case = make_case((2, 1, 5, True))
+    exact = make_solver("daqp").solve(case.problem, case.s0, case.weights)
+    more = exact.multipliers.copy()
+    more[:, -10:] -= np.where(exact.gaps.reshape(6, -1) < 1e-9, 2.0 * more[:, -10:], 0.0)
+    less = case.weights.gap + (exact.multipliers - more)[:, -10:].reshape(6, 5, 2)
+    residual = kkt_residual(
+        case.problem, case.s0, ComplementarityWeights(less, case.weights.force), replace(exact, multipliers=more)
+    )
+    pressed = (exact.multipliers[:, -10:] < -1e-3).any(axis=1)
+    assert pressed.any()
+    assert residual[pressed].min() > 1e-6
+    assert residual[~pressed].max(initial=0.0) < 1e-4
+
+
+@pytest.mark.parametrize("side", ["action_low", "action_high"])
+def test_the_optimality_check_sees_an_action_out_of_bounds_alone(side):
+    """The unbounded solution, held against bounds that it does not keep to."""
+    case = make_case((0, 1, 5, False))
+    exact = make_solver("daqp").solve(case.problem, case.s0, case.weights)
+    limit = np.median(exact.actions, axis=(0, 1))
+    tighter = replace(case.problem, **{side: limit})
+    residual = kkt_residual(tighter, case.s0, case.weights, exact)
+    outside = ((exact.actions - limit) * (1.0 if side == "action_high" else -1.0)).max(axis=(1, 2))
+    assert (outside > 1e-2).any()
+    assert residual[outside > 1e-2].min() > 1e-5
+
+
 def test_a_solution_without_multipliers_cannot_be_checked():
     case = make_case((1, 1, 1, True))
     solution = replace(make_solver("daqp").solve(case.problem, case.s0, case.weights), multipliers=None)
