@@ -46,6 +46,8 @@ def test_a_linear_system_is_recovered_exactly_and_the_contacts_stay_as_they_are(
     A, B, d = rng.normal(size=(3, 3)), rng.normal(size=(3, 2)), rng.normal(size=3)
     s, a = rng.normal(size=(300, 3)), rng.normal(size=(300, 2))
     lcs = LinearComplementaritySystem(3, 2, n_contacts, [0.5, 2.0, 1.0], [0.3, 1.0])
+    with torch.no_grad():
+        lcs.c_scaled.fill_(100.0)  # the contacts are far away
     names = ("C_scaled", "D_scaled", "E_scaled", "c_scaled", "F_factor", "F_skew")
     before = [getattr(lcs, name).clone() for name in names]
     residual = fit_tangent(lcs, transitions(s, a, s @ A.T + a @ B.T + d), np.zeros(3))
@@ -53,6 +55,38 @@ def test_a_linear_system_is_recovered_exactly_and_the_contacts_stay_as_they_are(
         np.testing.assert_allclose(found, truth, atol=1e-5)
     assert residual == pytest.approx(1e-3)  # the least it admits to
     assert all(torch.equal(getattr(lcs, name), old) for name, old in zip(names, before, strict=True))
+
+
+def test_the_smooth_part_is_fitted_beside_the_forces_of_known_contacts() -> None:
+    rng = np.random.default_rng(6)
+    A, B, d = np.eye(2) + 0.3 * rng.normal(size=(2, 2)), rng.normal(size=(2, 1)), 0.1 * rng.normal(size=2)
+    contacts = (rng.normal(size=(2, 1)), np.array([[1.0, 0.2]]), np.array([[0.1]]), np.array([[0.5]]), np.zeros(1))
+    C, *gap = contacts
+    truth = LinearComplementaritySystem.from_matrices(A, B, C, d, *gap)
+    lcs = LinearComplementaritySystem.from_matrices(np.eye(2), np.zeros((2, 1)), C, np.zeros(2), *gap)
+    s, a = rng.normal(size=(300, 2)), rng.normal(size=(300, 1))
+    touching = (truth.contact_force(s, a).detach().numpy() > 0).mean()
+    assert 0.3 < touching < 0.7  # far too many to be taken for outliers
+    fit_tangent(lcs, transitions(s, a, truth.step(s, a).detach().numpy()), np.zeros(2))
+    for found, true in zip(smooth_part(lcs), (A, B, d), strict=True):
+        np.testing.assert_allclose(found, true, atol=1e-5)
+
+
+def test_the_known_model_is_kept_where_the_data_say_nothing() -> None:
+    rng = np.random.default_rng(7)
+    A, B, d = np.eye(2) + 0.3 * rng.normal(size=(2, 2)), rng.normal(size=(2, 1)), rng.normal(size=2)
+    nothing = (np.zeros((2, 0)), np.zeros((0, 2)), np.zeros((0, 1)), np.zeros((0, 0)), np.zeros(0))
+    prior = LinearComplementaritySystem.from_matrices(A, B, nothing[0], d, *nothing[1:])
+    s, a = rng.normal(size=(100, 2)), np.zeros((100, 1))
+    s[:, 1] = 0.0  # neither the second state nor the action is tried
+    moved = A + np.array([[0.2, 0.0], [-0.1, 0.0]])
+    for given, expected_A, expected_B in ((prior, moved, B), (None, [[moved[0, 0], 0], [moved[1, 0], 1]], 0 * B)):
+        lcs = LinearComplementaritySystem(2, 1)
+        fit_tangent(lcs, transitions(s, a, s @ moved.T + d), np.zeros(2), given)
+        np.testing.assert_allclose(smooth_part(lcs)[0], expected_A, atol=1e-5)
+        np.testing.assert_allclose(smooth_part(lcs)[1], expected_B, atol=1e-5)
+    unchanged = (np.array_equal(old, new) for old, new in zip((A, B, d), smooth_part(prior), strict=True))
+    assert all(unchanged)
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.8])

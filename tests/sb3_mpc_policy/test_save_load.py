@@ -149,6 +149,14 @@ def test_training_goes_on_after_loading_with_all_transitions(name: str, tmp_path
     assert all(value.isfinite().all() for value in loaded.policy.parameters())
 
 
+def test_training_goes_on_without_replay_where_the_first_rollout_is_still_to_come(tmp_path: Path) -> None:
+    model = small_ppo(several(1), replay=False).learn(64)
+    model.save(tmp_path / "model")
+    loaded = PPO.load(tmp_path / "model", env=several(1), device="cpu")
+    loaded.learn(32, reset_num_timesteps=False)
+    assert len(policy_of(loaded).store) == 96 and np.isfinite(policy_of(loaded).mpc.cost_weight).all()
+
+
 def test_a2c_saves_and_loads(tmp_path: Path) -> None:
     model = A2C("MpcLcsPolicy", several(1), policy_kwargs=dict(horizon=3), device="cpu", seed=0).learn(20)
     model.save(tmp_path / "model")
