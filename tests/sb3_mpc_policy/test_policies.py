@@ -412,6 +412,19 @@ def test_the_first_model_is_copied_and_not_changed() -> None:
     np.testing.assert_array_equal(policy_of(model).lcs.state_scale, [0.5, 0.7])
 
 
+def test_the_direct_fit_keeps_to_the_first_model_where_there_is_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    priors = []
+    monkeypatch.setattr(
+        "sb3_mpc_policy.policies.fit_tangent", lambda lcs, data, target, prior: priors.append(prior) or 0
+    )
+    given = LinearComplementaritySystem(2, 1, 1, [0.5, 0.7], [0.4])
+    small_ppo(several(1), initial_lcs=given).learn(32)
+    assert priors and all(fingerprint(prior) == fingerprint(given) for prior in priors)
+    priors.clear()
+    small_ppo(several(1)).learn(32)
+    assert priors and set(priors) == {None}
+
+
 # -- what is logged --------------------------------------------------------------------------------------------
 
 
