@@ -282,7 +282,7 @@ class MpcLcsPolicy(ActorCriticPolicy):
             finally:
                 self.lcs.requires_grad_(True)
         # it keeps the graph of this batch, and a policy that holds a graph cannot be copied
-        self.action_dist.distribution = None
+        self.action_dist.distribution = None  # type: ignore[assignment]  # as in a new policy
         loss = self.prediction_loss()
         self._losses.append(loss.item())
         return values, add_to_backward(log_prob, self._mpc_arguments["prediction_coef"] * loss), entropy
