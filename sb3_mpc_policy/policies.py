@@ -29,6 +29,8 @@ __all__ = ["MpcLcsPolicy"]
 
 # The loss is taken over at most this many transitions, drawn anew for each rollout where there are more.
 _LARGEST_LOSS_BATCH = 4096
+# The fits between rollouts take the latest of this many, so that a long run's rollouts do not take longer and longer.
+_LARGEST_FIT = 20_000
 # Exploration at the start, as a share of the action scale.
 _INITIAL_NOISE = 0.2
 
@@ -68,7 +70,8 @@ class MpcLcsPolicy(ActorCriticPolicy):
     :param model_fit: "least_squares" between rollouts, or "gradient" for eq (16) alone
     :param policy_gradient: whether the gradient of PPO's own loss reaches the model, as in eq (16)
     :param replay: True to learn from all transitions so far, False from the current rollout alone (the paper's D_k)
-    :param state_scale: (n_x,) size of each state; from the first rollout where None
+    :param state_scale: (n_x,) size of each state where the controller works; the spread of the first rollout where
+        None, so pass it where rollouts are as short as A2C's
     :param action_scale: (n_a,); half the range of a bounded action, else one, where None
     :param initial_lcs: start from this model (copied); n_contacts and the scales are then those of the model
     :param kwargs: further arguments of ``ActorCriticPolicy``
@@ -187,12 +190,8 @@ class MpcLcsPolicy(ActorCriticPolicy):
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()
-        for name in (
-            "squash_output",
-            "full_std",
-            "use_expln",
-        ):  # belong to gSDE, which this policy does not have
-            data.pop(name, None)
+        for of_gsde in ("squash_output", "full_std", "use_expln"):
+            data.pop(of_gsde, None)
         data["share_features_extractor"] = self.share_features_extractor
         return data | self._mpc_arguments
 
@@ -321,7 +320,7 @@ class MpcLcsPolicy(ActorCriticPolicy):
         :return: what there is to log
         """
         log: dict[str, float] = {}
-        data = self.store.everything() if self._mpc_arguments["replay"] else self.store.rollout()
+        data = self.store.latest(_LARGEST_FIT) if self._mpc_arguments["replay"] else self.store.rollout()
         if len(data.s):  # none before the first rollout, nor, without replay, after loading
             if self._mpc_arguments["reward"] is None:
                 scales = self.lcs.state_scale.cpu().numpy(), self.lcs.action_scale.cpu().numpy()

@@ -63,6 +63,10 @@ class TransitionStore:
         """All transitions since the first."""
         return self._split(self.rows())
 
+    def latest(self, n: int) -> Transitions:
+        """The last n transitions, or all where there are fewer."""
+        return self._split(self.rows()[-n:])
+
     def rollout(self) -> Transitions:
         """The transitions of the current rollout."""
         return self._split(self.rows()[self._rollout_start :])

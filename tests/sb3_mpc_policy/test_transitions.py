@@ -37,6 +37,15 @@ def test_the_rollout_is_what_came_since_its_start() -> None:
     assert len(store.everything().s) == 9
 
 
+def test_the_latest_are_the_last_ones_across_batches() -> None:
+    store = TransitionStore(3, 2)
+    store.add(*batch(4, 0))
+    store.add(*batch(2, 1))
+    for found, one, two in zip(store.latest(3), batch(4, 0), batch(2, 1), strict=True):
+        np.testing.assert_array_equal(found, np.concatenate([one[-1:], two]))
+    assert len(store.latest(10).s) == 6
+
+
 def test_what_is_added_is_a_copy() -> None:
     store, given = TransitionStore(3, 2), batch(1)
     store.add(*given)
