@@ -55,7 +55,7 @@ class LcpSolver:
         :param q: (N, n)
         :return: the solution lam (N, n), and the active set (N, n), True where lam may be positive
         """
-        if self.n == 0:
+        if self.n == 0 or q.min(initial=0.0) >= 0.0:  # all contacts open, the commonest case
             return np.zeros_like(q), np.zeros(q.shape, dtype=bool)
         if self._modes is None:
             return _block_principal_pivoting(self.F, q)
