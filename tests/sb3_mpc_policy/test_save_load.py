@@ -154,7 +154,7 @@ def test_training_goes_on_without_replay_where_the_first_rollout_is_still_to_com
     model.save(tmp_path / "model")
     loaded = PPO.load(tmp_path / "model", env=several(1), device="cpu")
     loaded.learn(32, reset_num_timesteps=False)
-    assert len(policy_of(loaded).store) == 96 and np.isfinite(policy_of(loaded).mpc.cost_weight).all()
+    assert len(policy_of(loaded).store) == 96 and policy_of(loaded).mpc.cost_weight.isfinite().all()
 
 
 def test_a2c_saves_and_loads(tmp_path: Path) -> None:
