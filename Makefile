@@ -50,8 +50,9 @@ format: setup ## rewrite the sources as `check` wants them
 	$(BIN)/ruff format $(SOURCES)
 	$(BIN)/ruff check --fix $(SOURCES)
 
-benchmark: setup ## the learning benchmark, into benchmarks/results/
+benchmark: setup ## the learning benchmark and the engines' errors, into benchmarks/results/
 	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.learn --jobs $(WORKERS)
+	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.physics
 
 docs: setup ## build the documentation into docs/_build/html
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]'
