@@ -56,7 +56,8 @@ class LinearComplementaritySystem(nn.Module):
     """A learnable LCS for any number of contacts, ``n_contacts = 0`` (a linear model) included.
 
     A fresh model stands still: ``A`` is near the identity, ``C`` is small, both random; ``B`` is zero, so that a
-    controller that knows nothing does nothing; and every contact is open at the origin, its direction random. :meth:`from_matrices` starts from a known one.
+    controller that knows nothing does nothing; and every contact is open at the origin, its direction random.
+    :meth:`from_matrices` starts from a known one.
 
     :param n_states: n_x >= 1
     :param n_actions: n_a >= 1
