@@ -80,7 +80,10 @@ class QuadraticReward:
 
 def _weight(name: str, value: ArrayLike) -> np.ndarray:
     """A symmetric positive semidefinite matrix from a number, a diagonal or a matrix."""
-    array = np.asarray(value, dtype=np.float64)
+    try:
+        array = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name} must be a number, a vector of weights or a matrix, got {value!r}") from error
     if array.ndim > 2 or array.size == 0 or (array.ndim == 2 and array.shape[0] != array.shape[1]):
         raise ValueError(f"{name} must be a vector of weights or a square matrix, got shape {array.shape}")
     if not np.isfinite(array).all():

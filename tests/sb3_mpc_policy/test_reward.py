@@ -208,3 +208,11 @@ def test_the_flat_cost_is_the_distance_from_the_origin_in_scales():
     cost = flat_cost(np.array([2.0, 0.1]), np.array([10.0]))
     assert cost(np.array([2.0, 0.0]), np.zeros(1)) == pytest.approx(1.0)
     assert cost(np.array([2.0, 0.2]), np.array([10.0])) == pytest.approx(6.0)
+
+
+@pytest.mark.parametrize("weight", ["heavy", [[1.0, 2.0], [3.0]], None, {}])
+def test_a_weight_that_is_no_array_is_named(weight):
+    with pytest.raises(ValueError, match=r"^state_weight must be"):
+        QuadraticReward(weight, 1.0)
+    with pytest.raises(ValueError, match=r"^action_weight must be"):
+        QuadraticReward([1.0], weight)
