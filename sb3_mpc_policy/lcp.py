@@ -59,11 +59,15 @@ class LcpSolver:
             return np.zeros_like(q), np.zeros(q.shape, dtype=bool)
         if self._modes is None:
             return _block_principal_pivoting(self.F, q)
-        shape = (len(q), len(self._patterns), self.n)
-        forces = (q @ self._to_forces).reshape(shape)
-        gaps = (q @ self._to_gaps).reshape(shape)
+        lam, active = np.zeros_like(q), np.zeros(q.shape, dtype=bool)
+        closing = np.flatnonzero(~(q >= 0.0).all(axis=1))
+        some = q[closing]
+        shape = (len(some), len(self._patterns), self.n)
+        forces = (some @ self._to_forces).reshape(shape)
+        gaps = (some @ self._to_gaps).reshape(shape)
         best = np.minimum(forces, gaps).min(axis=2).argmax(axis=1)
-        return np.maximum(forces[np.arange(len(q)), best], 0.0), self._patterns[best]
+        lam[closing], active[closing] = np.maximum(forces[np.arange(len(some)), best], 0.0), self._patterns[best]
+        return lam, active
 
 
 def _mode_map(F: np.ndarray, active: np.ndarray) -> np.ndarray:

@@ -24,12 +24,12 @@ import numpy as np
 import torch
 from torch import nn
 
-from sb3_mpc_policy.lcp import LcpSolver
-from sb3_mpc_policy.lcs import LcsMatrices, LcsRollout, LinearComplementaritySystem, simulate
+from sb3_mpc_policy.lcs import LcsMatrices, LinearComplementaritySystem
 from sb3_mpc_policy.lqr import affine_lqr
 from sb3_mpc_policy.problem import ComplementarityWeights, RelaxedProblem
 from sb3_mpc_policy.reward import QuadraticCost, QuadraticReward, flat_cost
-from sb3_mpc_policy.solvers import Solution, make_solver
+from sb3_mpc_policy.simulation import LcsRollout, LcsSimulator, LinearFeedback
+from sb3_mpc_policy.solvers import CheckedSolver, Solution, make_solver
 from sb3_mpc_policy.terminal_value import TERMINAL_VALUES, QuadraticCritic
 
 __all__ = ["ControllerStatistics", "LcsMpc", "MpcPlan", "complementarity_weights"]
@@ -39,6 +39,8 @@ _FORCE_WEIGHT = 1e-4
 _LEAST_ACTION_WEIGHT = 1e-6
 # Change of a weight, relative to the penalty, below which a pass would repeat the one before.
 _SAME_WEIGHTS = 1e-3
+# Forces and gaps up to this, in scaled coordinates, are none: the solvers' tolerance.
+_EXACT = 1e-9
 
 
 @dataclass(frozen=True)
@@ -107,7 +109,9 @@ class LcsMpc(nn.Module):
     :param penalty: rho > 0, relative to the mean stage weight in scaled coordinates
     :param smoothing: epsilon >= 0, scaled coordinates
     :param n_iterations: passes of the relaxation, >= 1
-    :param solver: "auto", "daqp" or "cvxpylayers"
+    :param solver: "auto", "daqp", "torch" or "cvxpylayers"
+    :param check: whether every solution must meet the optimality conditions (solvers/check.py); one that does not is
+        replaced like one that was not found
     """
 
     cost_weight: torch.Tensor
@@ -125,6 +129,7 @@ class LcsMpc(nn.Module):
         smoothing: float = 1e-6,
         n_iterations: int = 2,
         solver: str = "auto",
+        check: bool = False,
     ) -> None:
         super().__init__()
         for name, value in (("horizon", horizon), ("n_iterations", n_iterations)):
@@ -147,11 +152,11 @@ class LcsMpc(nn.Module):
         self.horizon, self.n_iterations = int(horizon), int(n_iterations)
         self.penalty, self.smoothing = float(penalty), float(smoothing)
         self.terminal_value = TERMINAL_VALUES[terminal_value]()
-        self.solver = make_solver(solver)
+        self.solver = CheckedSolver(make_solver(solver)) if check else make_solver(solver)
         self.statistics = ControllerStatistics()
         self._problem: RelaxedProblem | None = None
         self._problem_key: bytes = b""
-        self._lcp = LcpSolver(np.zeros((0, 0)))
+        self._simulator: LcsSimulator
 
         n_x, n_a = lcs.n_states, lcs.n_actions
         for name, shape in (
@@ -163,6 +168,11 @@ class LcsMpc(nn.Module):
             ("feedback_offset", (n_a,)),
         ):
             self.register_buffer(name, torch.zeros(shape, dtype=torch.float64))
+        # all that a problem is made of, by name: torch's own iterators take longer than a solve
+        self._tensors = [
+            [name for name, _ in (*owner.named_parameters(recurse=False), *owner.named_buffers(recurse=False))]
+            for owner in (self, lcs)
+        ]
         scales = self._numpy("state_scale", lcs), self._numpy("action_scale", lcs)
         self.set_cost(flat_cost(*scales) if reward is None else reward.cost(n_x, n_a))
         self.refresh()
@@ -220,27 +230,28 @@ class LcsMpc(nn.Module):
         return W, self._numpy("cost_slope") * scale
 
     def _current_problem(self) -> RelaxedProblem:
-        """The problem for the present parameters; kept while they do not change."""
-        model = self._numpy_model()
-        constants = [self._numpy(name) for name in ("terminal_weight", "terminal_slope", "cost_weight", "cost_slope")]
-        scales = [self._numpy(name, self.lcs) for name in ("state_scale", "action_scale")]
-        key = b"".join(part.tobytes() for part in (*model, *constants, *scales))
+        """The problem for the present parameters, and the simulator beside it; kept while they do not change."""
+        owners = zip((self, self.lcs), self._tensors, strict=True)
+        key = b"".join(self._numpy(name, owner).tobytes() for owner, names in owners for name in names)
         if self._problem is None or key != self._problem_key:
             W, w = self._scaled_cost()
             action_scale = self._numpy("action_scale", self.lcs)
             self._problem = RelaxedProblem(
-                model=LcsMatrices(*(matrix.copy() for matrix in model)),
+                model=LcsMatrices(*(matrix.copy() for matrix in self._numpy_model())),
                 stage_weight=W,
                 stage_slope=w,
-                terminal_weight=constants[0].copy(),
-                terminal_slope=constants[1].copy(),
+                terminal_weight=self._numpy("terminal_weight").copy(),
+                terminal_slope=self._numpy("terminal_slope").copy(),
                 action_low=self.action_low / action_scale,
                 action_high=self.action_high / action_scale,
                 horizon=self.horizon,
                 force_weight=_FORCE_WEIGHT * _mean_weight(W),
+                device=str(self.cost_weight.device),
             )
             self._problem_key = key
-            self._lcp = LcpSolver(self._problem.model.F)
+            gain, offset = self._numpy("feedback_gain").copy(), self._numpy("feedback_offset").copy()
+            feedback = LinearFeedback(gain, offset, self._problem.action_low, self._problem.action_high)
+            self._simulator = LcsSimulator(self._problem.model, feedback)
         return self._problem
 
     # -- the relaxation loop ------------------------------------------------------------------------------------
@@ -277,15 +288,27 @@ class LcsMpc(nn.Module):
         """Solve the relaxed problem; simulate the LCS under its actions; the cost of that simulation."""
         solution = self.solver.solve(problem, s0, weights)
         self._stand_in(problem, solution, s0)
-        rollout = simulate(problem.model, self._lcp, s0, solution.actions)
+        rollout = self._simulated(s0, solution)
         return solution, problem.cost(rollout.states, solution.actions), rollout
 
+    def _simulated(self, s0: np.ndarray, solution: Solution) -> LcsRollout:
+        """The LCS itself under the solution's actions."""
+        # A plan without any product of force and gap is a trajectory of the LCS, which has only one for these actions.
+        product = np.minimum(solution.forces, solution.gaps).reshape(len(s0), -1)
+        rest = np.flatnonzero(~(np.abs(product).max(axis=1, initial=0.0) <= _EXACT) | ~solution.solved)
+        if len(rest) == len(s0):
+            return self._simulator.under(s0, solution.actions)
+        rollout = LcsRollout(solution.states, solution.actions, solution.forces, solution.gaps)
+        if len(rest):
+            rollout = LcsRollout(*(part.copy() for part in rollout))
+            for whole, part in zip(rollout, self._simulator.under(s0[rest], solution.actions[rest]), strict=True):
+                whole[rest] = part
+        return rollout
+
     def _first_nominal(self, problem: RelaxedProblem, s0: np.ndarray, previous: np.ndarray | None) -> LcsRollout:
-        bounds = (problem.action_low, problem.action_high)
-        feedback = (self._numpy("feedback_gain"), self._numpy("feedback_offset"))
-        nominal = simulate(problem.model, self._lcp, s0, horizon=problem.horizon, feedback=feedback, bounds=bounds)
+        nominal = self._simulator.regulated(s0, problem.horizon)
         if previous is not None:
-            shifted = simulate(problem.model, self._lcp, s0, previous)
+            shifted = self._simulator.under(s0, previous)
             better = problem.cost(shifted.states, shifted.actions) < problem.cost(nominal.states, nominal.actions)
             for mine, other in zip(nominal, shifted, strict=True):
                 mine[better] = other[better]

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from gymnasium import spaces
 from numpy.typing import ArrayLike
-from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.common.utils import get_device
@@ -62,7 +62,9 @@ class MpcLcsPolicy(ActorCriticPolicy):
     :param penalty: rho of the relaxation, relative to the size of the cost
     :param smoothing: epsilon of the relaxation, scaled coordinates
     :param n_iterations: passes of the relaxation
-    :param solver: "auto", "daqp" or "cvxpylayers"
+    :param solver: "auto", "daqp", "torch" or "cvxpylayers"
+    :param check: whether every solution must meet the optimality conditions; the regulator stands in for one that
+        does not
     :param prediction_coef: alpha of eq (15)
     :param preset: "default", or "paper" for Algorithm 1 as printed; sets ``prediction_loss``, ``model_fit`` and
         ``replay`` where they are None
@@ -97,6 +99,7 @@ class MpcLcsPolicy(ActorCriticPolicy):
         smoothing: float = 1e-6,
         n_iterations: int = 2,
         solver: str = "auto",
+        check: bool = False,
         prediction_coef: float = 100.0,
         preset: str = "default",
         prediction_loss: str | None = None,
@@ -137,7 +140,7 @@ class MpcLcsPolicy(ActorCriticPolicy):
 
         self._mpc_arguments: dict[str, Any] = dict(
             horizon=horizon, n_contacts=n_contacts, reward=reward, terminal_value=terminal_value, penalty=penalty,
-            smoothing=smoothing, n_iterations=n_iterations, solver=solver, prediction_coef=prediction_coef,
+            smoothing=smoothing, n_iterations=n_iterations, solver=solver, check=check, prediction_coef=prediction_coef,
             preset=preset, prediction_loss=prediction_loss, model_fit=model_fit, policy_gradient=policy_gradient,
             replay=replay, state_scale=state_scale, action_scale=action_scale, initial_lcs=initial_lcs,
             log_std_init=log_std_init,
@@ -169,7 +172,7 @@ class MpcLcsPolicy(ActorCriticPolicy):
         lcs = _make_lcs(self._sizes, given, low, high)
         self.action_net = LcsMpc(
             lcs, given["reward"], low, high, given["horizon"], given["terminal_value"], given["penalty"],
-            given["smoothing"], given["n_iterations"], given["solver"],
+            given["smoothing"], given["n_iterations"], given["solver"], given["check"],
         )  # fmt: skip
         scale_is_known = given["state_scale"] is not None or given["initial_lcs"] is not None
         self.register_buffer("_scale_is_set", torch.tensor(scale_is_known))
@@ -262,6 +265,18 @@ class MpcLcsPolicy(ActorCriticPolicy):
         :param previous: the plan made one step earlier, see :meth:`LcsMpc.plan`
         """
         return self.mpc.plan(np.asarray(observation, dtype=np.float64), previous)
+
+    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> torch.Tensor:
+        if not deterministic:
+            return super()._predict(observation, deterministic)
+        # the mode of the Gaussian, without making one
+        mean: torch.Tensor = self.mpc(BasePolicy.extract_features(self, observation, self.pi_features_extractor))
+        return mean
+
+    def set_training_mode(self, mode: bool) -> None:
+        """As in the base class, which visits every module for each action, also where nothing changes."""
+        if mode != self.training:
+            super().set_training_mode(mode)
 
     def evaluate_actions(
         self, obs: PyTorchObs, actions: torch.Tensor

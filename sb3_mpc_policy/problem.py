@@ -44,6 +44,7 @@ class RelaxedProblem:
     :param action_high: (n_a,), may be inf
     :param horizon: H >= 1
     :param force_weight: delta > 0
+    :param device: where the model's parameters live; solvers for whole batches work there
     """
 
     model: LcsMatrices[np.ndarray]
@@ -55,6 +56,7 @@ class RelaxedProblem:
     action_high: np.ndarray
     horizon: int
     force_weight: float
+    device: str = "cpu"
 
     @property
     def sizes(self) -> tuple[int, int, int]:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
+
 import daqp
 import numpy as np
 import torch
@@ -9,7 +12,8 @@ import torch
 from sb3_mpc_policy.lcs import LcsMatrices
 from sb3_mpc_policy.problem import ComplementarityWeights, RelaxedProblem
 from sb3_mpc_policy.solvers.base import Solution, Solver
-from sb3_mpc_policy.solvers.condensed import CondensedProblem, attach_gradient
+from sb3_mpc_policy.solvers.condensed import CondensedProblem
+from sb3_mpc_policy.solvers.gradient import attach_gradient
 
 __all__ = ["DaqpSolver"]
 
@@ -21,69 +25,44 @@ _ATTEMPTS: dict[str, dict[str, float]] = {
     "plain": {"primal_tol": 1e-9},
     "proximal": {"primal_tol": 1e-9, "eps_prox": 1e-6},
 }
+# A solve lets go of Python's lock, the call around it does not: on fewer variables threads would wait for each other.
+_THREADED_SIZE = 60
+_LEAST_PER_THREAD = 16
 
 
 class DaqpSolver(Solver):
-    """One factorisation for the batch; a change of linear term and bounds for each problem."""
+    """One factorisation for the batch; a change of linear term and bounds for each problem.
+
+    On problems large enough to gain by it, it uses as many threads as torch does (``torch.set_num_threads``).
+    """
 
     def __init__(self) -> None:
         self._condensed: CondensedProblem | None = None
-        self._models: dict[str, daqp.Model] = {}
+        self._workspaces: list[_Workspace] = []
 
     def _prepare(self, problem: RelaxedProblem) -> CondensedProblem:
         if self._condensed is None or self._condensed.problem is not problem:
             self._condensed = CondensedProblem(problem)
-            self._models = {}
+            self._workspaces = []
         return self._condensed
 
     def solve(self, problem: RelaxedProblem, s0: np.ndarray, weights: ComplementarityWeights) -> Solution:
         condensed = self._prepare(problem)
-        n_gaps = len(condensed.G)
-        slope = condensed.slope(s0, weights)
-        upper = np.minimum(np.concatenate([condensed.high, np.full(n_gaps, _UNBOUNDED)]), _UNBOUNDED)
-        lower = np.empty((len(s0), condensed.n + n_gaps))
-        lower[:, : condensed.n] = np.maximum(condensed.low, -_UNBOUNDED)
-        lower[:, condensed.n :] = -condensed.gap_offset(s0)
-        guess = _guessed_active_set(condensed, weights)
-
-        x, multipliers = np.zeros_like(slope), np.zeros_like(lower)
-        solved = np.zeros(len(s0), dtype=bool)
+        batch = _Batch(condensed, s0, weights)
         if np.isfinite(condensed.Q).all() and np.isfinite(condensed.G).all():
-            for i in np.flatnonzero(np.isfinite(slope).all(axis=1) & np.isfinite(lower).all(axis=1)):
-                for attempt in _ATTEMPTS:
-                    x[i], multipliers[i], solved[i] = self._solve_one(
-                        attempt, condensed, slope[i], upper, lower[i], guess[i]
-                    )
-                    if solved[i]:
-                        break
-        return condensed.expand(x, s0, solved, multipliers)
-
-    def _solve_one(
-        self,
-        attempt: str,
-        condensed: CondensedProblem,
-        slope: np.ndarray,
-        upper: np.ndarray,
-        lower: np.ndarray,
-        guess: np.ndarray,
-    ) -> tuple[np.ndarray, np.ndarray, bool]:
-        model = self._models.get(attempt)
-        if model is None:
-            model = daqp.Model()
-            model.settings = _ATTEMPTS[attempt]
-            flag, _ = model.setup(condensed.Q, slope, condensed.G, upper, lower, guess)
-            if flag >= 0:  # a workspace that was refused must not be updated
-                self._models[attempt] = model
-        else:
-            flag = model.update(f=slope, bupper=upper, blower=lower, sense=guess)
-        if flag < 0:
-            return np.zeros_like(slope), np.zeros_like(lower), False
-        x, _, flag, info = model.solve()
-        return (
-            x,
-            info["lam"],
-            bool(flag == _OPTIMAL and np.isfinite(x).all() and np.isfinite(info["lam"]).all()),
-        )
+            usable = np.flatnonzero(np.isfinite(batch.slope).all(axis=1) & np.isfinite(batch.lower).all(axis=1))
+            threads = 1
+            if condensed.n >= _THREADED_SIZE:
+                threads = max(1, min(torch.get_num_threads(), len(usable) // _LEAST_PER_THREAD))
+            while len(self._workspaces) < threads:
+                self._workspaces.append(_Workspace(condensed))
+            if threads == 1:
+                self._workspaces[0].solve(batch, usable)
+            else:
+                with ThreadPoolExecutor(threads) as pool:
+                    shares = np.array_split(usable, threads)
+                    list(pool.map(_Workspace.solve, self._workspaces, [batch] * threads, shares))
+        return condensed.expand(batch.x, s0, batch.solved, batch.multipliers)
 
     def differentiable_actions(
         self,
@@ -96,7 +75,51 @@ class DaqpSolver(Solver):
         return attach_gradient(self._prepare(problem), model, s0, weights, solution)
 
     def __getstate__(self) -> dict[str, object]:
-        return {"_condensed": None, "_models": {}}  # the C workspace is rebuilt where it is needed
+        return {"_condensed": None, "_workspaces": []}  # the C workspaces are rebuilt where they are needed
+
+
+class _Batch:
+    """What differs between the problems, and their results."""
+
+    def __init__(self, condensed: CondensedProblem, s0: np.ndarray, weights: ComplementarityWeights) -> None:
+        n, n_gaps = condensed.n, len(condensed.G)
+        self.slope = condensed.slope(s0, weights)
+        self.lower = np.empty((len(s0), n + n_gaps))
+        self.lower[:, :n] = np.maximum(condensed.low, -_UNBOUNDED)
+        self.lower[:, n:] = -condensed.gap_offset(s0)
+        self.guess = _guessed_active_set(condensed, weights)
+        self.x, self.multipliers = np.zeros_like(self.slope), np.zeros_like(self.lower)
+        self.solved = np.zeros(len(s0), dtype=bool)
+
+
+class _Workspace:
+    """DAQP's memory for one model, a thread's own."""
+
+    def __init__(self, condensed: CondensedProblem) -> None:
+        self._Q, self._G = condensed.Q, condensed.G
+        upper = np.concatenate([condensed.high, np.full(len(condensed.G), _UNBOUNDED)])
+        self._upper = np.minimum(upper, _UNBOUNDED)
+        self._models: dict[str, daqp.Model] = {}
+
+    def solve(self, batch: _Batch, index: Iterable[int]) -> None:
+        for i in index:
+            batch.solved[i] = any(self._attempt(attempt, batch, i) for attempt in _ATTEMPTS)
+
+    def _attempt(self, attempt: str, batch: _Batch, i: int) -> bool:
+        model = self._models.get(attempt)
+        if model is None:
+            model = daqp.Model()
+            model.settings = _ATTEMPTS[attempt]
+            flag, _ = model.setup(self._Q, batch.slope[i], self._G, self._upper, batch.lower[i], batch.guess[i])
+            if flag >= 0:  # a workspace that was refused must not be updated
+                self._models[attempt] = model
+        else:
+            flag = model.update(f=batch.slope[i], blower=batch.lower[i], sense=batch.guess[i])
+        if flag < 0:
+            return False
+        batch.x[i], _, flag, info = model.solve()
+        batch.multipliers[i] = info["lam"]
+        return bool(flag == _OPTIMAL and np.isfinite(batch.x[i]).all() and np.isfinite(batch.multipliers[i]).all())
 
 
 def _guessed_active_set(condensed: CondensedProblem, weights: ComplementarityWeights) -> np.ndarray:

@@ -11,8 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from contact_envs.dynamics import CartPoleParameters, integrate, true_lcs
-from sb3_mpc_policy.lcp import LcpSolver
-from sb3_mpc_policy.lcs import KAPPA, LcsMatrices, LinearComplementaritySystem, simulate
+from sb3_mpc_policy.lcs import KAPPA, LcsMatrices, LinearComplementaritySystem
 
 
 def arrays(lcs: LinearComplementaritySystem) -> LcsMatrices[np.ndarray]:
@@ -232,44 +231,7 @@ def test_contact_force_is_differentiable(random_model, parameter_gradients):
         np.testing.assert_allclose(getattr(lcs, name).grad, expected[name], rtol=1e-5, atol=1e-6, err_msg=name)
 
 
-# -- trajectories --------------------------------------------------------------------------------------------------
-
-
-def test_simulate_repeats_the_step(random_model):
-    lcs = random_model(7, 3, 2, 3)
-    model = arrays(lcs)
-    rng = np.random.default_rng(0)
-    s0, actions = rng.normal(size=(6, 3)), rng.normal(size=(6, 4, 2))
-    rollout = simulate(model, LcpSolver(model.F), s0, actions)
-    s = torch.as_tensor(s0)
-    for k in range(4):
-        np.testing.assert_allclose(rollout.states[:, k], s, rtol=1e-9, atol=1e-10)
-        force = lcs.contact_force(s, actions[:, k]).detach()
-        np.testing.assert_allclose(rollout.forces[:, k], force, rtol=1e-7, atol=1e-9)
-        gap = s @ lcs.D.mT + torch.as_tensor(actions[:, k]) @ lcs.E.mT + force @ lcs.F.mT + lcs.c
-        np.testing.assert_allclose(rollout.gaps[:, k], gap.detach(), rtol=1e-7, atol=1e-9)
-        s = lcs.step(s, actions[:, k]).detach()
-    np.testing.assert_allclose(rollout.states[:, -1], s, rtol=1e-9, atol=1e-10)
-    np.testing.assert_array_equal(rollout.actions, actions)
-
-
-def test_simulated_feedback_is_clipped(random_model):
-    model = arrays(random_model(7))
-    s0 = np.random.default_rng(0).normal(size=(6, 3))
-    gain, offset = np.array([[1.0, -2.0, 0.5]]), np.array([0.1])
-    bounds = np.array([-0.3]), np.array([0.5])
-    rollout = simulate(model, LcpSolver(model.F), s0, horizon=5, feedback=(gain, offset), bounds=bounds)
-    np.testing.assert_allclose(rollout.actions, np.clip(rollout.states[:, :-1] @ gain.T + offset, *bounds))
-    assert rollout.actions.min() == -0.3
-    assert rollout.actions.max() == 0.5
-    again = simulate(model, LcpSolver(model.F), s0, rollout.actions)
-    np.testing.assert_array_equal(again.states, rollout.states)
-
-
-def test_simulate_needs_to_know_the_actions(random_model):
-    model = arrays(random_model(7))
-    with pytest.raises(ValueError, match="actions, or feedback with bounds"):
-        simulate(model, LcpSolver(model.F), np.zeros((1, 3)), horizon=3)
+# -- the cart-pole ---------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("start", [[0.1, 0.2, 0.05, -0.3], [0.345, 0.3, 0.02, 0.2], [-0.33, -0.2, -0.05, -0.5]])

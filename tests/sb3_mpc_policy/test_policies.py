@@ -541,7 +541,11 @@ REFUSED: dict[str, tuple[dict[str, Any], type[Exception], str]] = {
     "smoothing": (dict(smoothing=-1.0), ValueError, r"smoothing must be a finite number >= 0, got -1.0"),
     "coefficient": (dict(prediction_coef=-1.0), ValueError, r"prediction_coef must be a finite number >= 0, got -1"),
     "nan coefficient": (dict(prediction_coef=np.nan), ValueError, r"prediction_coef must be a finite .*got nan"),
-    "solver": (dict(solver="none"), ValueError, r"solver must be 'auto' or one of \['cvxpylayers', 'daqp'.*got 'none'"),
+    "solver": (
+        dict(solver="none"),
+        ValueError,
+        r"solver must be 'auto' or one of \['cvxpylayers', .*got 'none'",
+    ),
     "terminal_value": (dict(terminal_value="x"), ValueError, r"terminal_value must be one of \['critic', .*got 'x'"),
     "loss": (
         dict(prediction_loss="x"),

@@ -15,6 +15,7 @@ import torch
 from stable_baselines3 import A2C, PPO
 
 from sb3_mpc_policy import LinearComplementaritySystem, MpcLcsPolicy, QuadraticReward
+from sb3_mpc_policy.solvers import CheckedSolver
 from tests.sb3_mpc_policy.toy_environments import box_env, fingerprint, point_mass, policy_of, several, small_ppo
 
 STATES = np.random.default_rng(0).normal(size=(6, 2))
@@ -25,9 +26,9 @@ ARGUMENTS: dict[str, dict[str, Any]] = {
     "one": dict(
         net_arch=dict(pi=[], vf=[7, 5]), activation_fn=torch.nn.ReLU, ortho_init=False, log_std_init=-1.1, horizon=4,
         n_contacts=3, reward=QuadraticReward([1.0, 2.0], 0.3, target=[0.1, 0.0], constant=2.0), terminal_value="none",
-        penalty=50.0, smoothing=1e-3, n_iterations=3, solver="daqp", prediction_coef=7.0, prediction_loss="violation",
-        model_fit="gradient", policy_gradient=False, replay=False, state_scale=[0.4, 0.9], action_scale=[0.3],
-        normalize_images=False, share_features_extractor=False, optimizer_class=torch.optim.SGD,
+        penalty=50.0, smoothing=1e-3, n_iterations=3, solver="daqp", check=True, prediction_coef=7.0,
+        prediction_loss="violation", model_fit="gradient", policy_gradient=False, replay=False,
+        state_scale=[0.4, 0.9], action_scale=[0.3], normalize_images=False, share_features_extractor=False, optimizer_class=torch.optim.SGD,
         optimizer_kwargs=dict(momentum=0.5), features_extractor_kwargs={},
     ),
     "two": dict(
@@ -131,7 +132,8 @@ def test_the_arguments_act_after_loading(tmp_path: Path) -> None:
     assert [layer.out_features for layer in policy.mlp_extractor.value_net if hasattr(layer, "out_features")] == [7, 5]
     mpc = policy.mpc
     assert (mpc.horizon, mpc.penalty, mpc.smoothing, mpc.n_iterations) == (4, 50.0, 1e-3, 3)
-    assert type(mpc.solver).__name__ == "DaqpSolver" and type(mpc.terminal_value).__name__ == "NoValue"
+    assert isinstance(mpc.solver, CheckedSolver) and type(mpc.solver.solver).__name__ == "DaqpSolver"
+    assert type(mpc.terminal_value).__name__ == "NoValue"
     np.testing.assert_array_equal(mpc.cost_weight, np.diag([1.0, 2.0, 0.3]))
 
 

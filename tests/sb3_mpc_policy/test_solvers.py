@@ -12,19 +12,20 @@ import numpy as np
 import pytest
 import torch
 
-from sb3_mpc_policy.lcp import LcpSolver
-from sb3_mpc_policy.lcs import LcsMatrices, LinearComplementaritySystem, simulate
+from sb3_mpc_policy.lcs import LcsMatrices, LinearComplementaritySystem
 from sb3_mpc_policy.lqr import affine_lqr
 from sb3_mpc_policy.mpc import complementarity_weights
 from sb3_mpc_policy.problem import ComplementarityWeights, RelaxedProblem, relaxed_problem
-from sb3_mpc_policy.solvers import SOLVERS, Solution, daqp, kkt_residual, make_solver
+from sb3_mpc_policy.simulation import LcsSimulator, LinearFeedback
+from sb3_mpc_policy.solvers import SOLVERS, CheckedSolver, Solution, auto, daqp, kkt_residual, make_solver
+from sb3_mpc_policy.solvers.auto import choose
 
 # cvxpylayers' own, on NumPy 2
 pytestmark = pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")
 
 N_X = 3
 # Of the actions. The layer solves a cone programme, in which they are known to the root of its tolerance only.
-TOLERANCE = {"daqp": 1e-5, "cvxpylayers": 1e-4}
+TOLERANCE = {"daqp": 1e-5, "torch": 1e-5, "cvxpylayers": 1e-4}
 # n_lambda, n_a, H, bounded
 FAMILIES = list(product([0, 1, 2, 4], [1, 2], [1, 5, 10], [True, False]))
 SOLVED_BY = [pytest.param(*pair, id="-".join(map(str, pair))) for pair in product(SOLVERS, FAMILIES)]
@@ -82,15 +83,15 @@ def make_case(family: tuple[int, int, int, bool], n: int = 6) -> Case:
         force_weight=1e-4 * np.trace(stage_weight),
     )  # fmt: skip
     candidates = rng.normal(size=(30 * n, N_X)) * rng.uniform(0.1, 1.5, (30 * n, 1))
-    feedback, bounds = (lqr.K, lqr.k), (problem.action_low, problem.action_high)
-    lcp = LcpSolver(model.F)
-    rollout = simulate(model, lcp, candidates, horizon=horizon, feedback=feedback, bounds=bounds)
+    bounds = problem.action_low, problem.action_high
+    simulator = LcsSimulator(model, LinearFeedback(lqr.K, lqr.k, *bounds))
+    rollout = simulator.regulated(candidates, horizon)
     touching = rollout.forces.any(axis=(1, 2))
     limited = ((rollout.actions == bounds[0]) | (rollout.actions == bounds[1])).any(axis=(1, 2))
     groups = [np.flatnonzero((touching == t) & (limited == m)) for t, m in product([False, True], repeat=2)]
     in_turn = [i for some in zip_longest(*groups) for i in some if i is not None]
     s0 = candidates[in_turn[:n]]
-    nominal = simulate(model, lcp, s0, horizon=horizon, feedback=feedback, bounds=bounds)
+    nominal = simulator.regulated(s0, horizon)
     weights = complementarity_weights(nominal.forces, nominal.gaps, np.diag(model.F), 50.0, 1e-3)
     return Case(lcs, problem, s0, weights)
 
@@ -178,10 +179,10 @@ def test_the_families_hold_what_they_are_meant_to():
         assert not hits.all(), family
 
 
-@pytest.mark.parametrize("family", FAMILIES, ids=str)
-def test_the_active_set_method_meets_the_optimality_conditions(family):
+@pytest.mark.parametrize(("solver", "family"), list(product(["daqp", "torch"], FAMILIES)), ids=str)
+def test_the_solution_meets_the_optimality_conditions(solver, family):
     case = make_case(family, n=40)
-    solution = make_solver("daqp").solve(case.problem, case.s0, case.weights)
+    solution = make_solver(solver).solve(case.problem, case.s0, case.weights)
     assert solution.solved.all()
     assert kkt_residual(case.problem, case.s0, case.weights, solution).max() < 1e-8
 
@@ -239,11 +240,35 @@ def test_the_optimality_check_sees_an_action_out_of_bounds_alone(side):
     assert residual[outside > 1e-2].min() > 1e-5
 
 
-def test_a_solution_without_multipliers_cannot_be_checked():
-    case = make_case((1, 1, 1, True))
-    solution = replace(make_solver("daqp").solve(case.problem, case.s0, case.weights), multipliers=None)
-    with pytest.raises(ValueError, match="no multipliers"):
-        kkt_residual(case.problem, case.s0, case.weights, solution)
+@pytest.mark.parametrize("family", [(0, 1, 1, True), (2, 1, 5, True), (4, 2, 10, True)])
+def test_a_solution_without_multipliers_is_checked_with_those_that_fit(family):
+    case = make_case(family)
+    exact = replace(make_solver("daqp").solve(case.problem, case.s0, case.weights), multipliers=None)
+    assert kkt_residual(case.problem, case.s0, case.weights, exact).max() < 1e-9
+    off = replace(exact, actions=exact.actions + 1e-3)
+    assert kkt_residual(case.problem, case.s0, case.weights, off).min() > 1e-5
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_a_checked_solver_rejects_what_is_no_solution(solver, monkeypatch):
+    case = make_case((2, 1, 5, True))
+    checked = CheckedSolver(make_solver(solver))
+    right = checked.solve(case.problem, case.s0, case.weights)
+    assert right.solved.all()
+    assert 0.0 < checked.largest_residual < 1e-6
+    none = case[np.arange(0)]
+    assert checked.solve(none.problem, none.s0, none.weights).solved.shape == (0,)
+
+    def wrong(*arguments):
+        solution = make_solver(solver).solve(*arguments)
+        solution.actions[2] += 1e-2
+        solution.actions[3] = np.nan
+        solution.solved[4] = False
+        return solution
+
+    monkeypatch.setattr(checked.solver, "solve", wrong)
+    after = checked.solve(case.problem, case.s0, case.weights)
+    np.testing.assert_array_equal(after.solved, [True, True, False, False, False, True])
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
@@ -296,10 +321,11 @@ def test_a_model_that_is_not_finite_fails_everywhere(solver):
         assert not make_solver(solver).solve(broken, case.s0, case.weights).solved.any(), name
 
 
-def test_a_problem_that_is_not_convex_fails_and_harms_no_other():
+@pytest.mark.parametrize("name", ["daqp", "torch"])
+def test_a_problem_that_is_not_convex_fails_and_harms_no_other(name):
     case = make_case((2, 1, 5, True))
     concave = replace(case.problem, stage_weight=-case.problem.stage_weight, terminal_weight=np.zeros((N_X, N_X)))
-    solver = make_solver("daqp")
+    solver = make_solver(name)
     for _ in range(2):
         assert not solver.solve(concave, case.s0, case.weights).solved.any()
     assert solver.solve(case.problem, case.s0, case.weights).solved.all()
@@ -309,14 +335,13 @@ def test_a_problem_that_is_not_convex_fails_and_harms_no_other():
 def test_the_proximal_form_that_stands_by_finds_the_same_solution(family, monkeypatch):
     case = make_case(family)
     tried = []
-    plain = daqp.DaqpSolver._solve_one
+    once = daqp._Workspace._attempt
 
     def fails_at_first(self, attempt, *rest):
         tried.append(attempt)
-        x, multipliers, solved = plain(self, attempt, *rest)
-        return x, multipliers, solved and attempt != "plain"
+        return once(self, attempt, *rest) and attempt != "plain"
 
-    monkeypatch.setattr(daqp.DaqpSolver, "_solve_one", fails_at_first)
+    monkeypatch.setattr(daqp._Workspace, "_attempt", fails_at_first)
     solution = make_solver("daqp").solve(case.problem, case.s0, case.weights)
     assert tried == ["plain", "proximal"] * len(case.s0)
     assert solution.solved.all()
@@ -481,12 +506,39 @@ def test_the_cost_is_that_of_eq_6():
 
 
 def test_an_unknown_solver_is_named_with_those_there_are():
-    with pytest.raises(ValueError, match=r"^solver must be 'auto' or one of \['cvxpylayers', 'daqp'\], got 'osqp'"):
+    there_are = r"\['cvxpylayers', 'daqp', 'torch'\]"
+    with pytest.raises(ValueError, match=rf"^solver must be 'auto' or one of {there_are}, got 'osqp'"):
         make_solver("osqp")
 
 
-def test_the_automatic_choice_is_one_of_the_solvers():
-    assert type(make_solver("auto")) in {type(make_solver(name)) for name in SOLVERS}
+def test_the_table_of_choices_has_a_solver_for_every_batch():
+    for device, batch, horizon in product(["cpu", "cuda", "mps"], [1, 2047, 10**6], [1, 10**4]):
+        assert choose(device, batch, horizon) in SOLVERS
+    assert choose("cuda", 10**6, 10) == "torch"
+    assert choose("cpu", 10**6, 10) == "daqp"
+
+
+def test_the_automatic_choice_solves_and_differentiates_like_the_solver_it_stands_for(monkeypatch):
+    case = make_case((2, 1, 5, True))
+    weight = np.ones((6, 5, 1))
+    expected = gradients("daqp", case, weight)
+    for name in ("daqp", "torch"):
+        monkeypatch.setattr(auto, "choose", lambda *_, name=name: name)
+        assert_close(gradients("auto", case, weight), expected, 1e-8)
+
+
+def test_daqp_gives_the_same_on_any_number_of_threads():
+    case = make_case((4, 2, 10, True), n=80)
+    threads = torch.get_num_threads()
+    try:
+        torch.set_num_threads(1)
+        one = make_solver("daqp").solve(case.problem, case.s0, case.weights)
+        torch.set_num_threads(3)
+        three = make_solver("daqp").solve(case.problem, case.s0, case.weights)
+    finally:
+        torch.set_num_threads(threads)
+    assert three.solved.all()
+    np.testing.assert_allclose(three.actions, one.actions, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
