@@ -57,7 +57,7 @@ def test_a_feedback_acts_on_every_state_and_is_clipped(random_model):
 def test_states_that_touch_nothing_and_states_that_do_are_simulated_alike(cart_pole):
     """The pole starts between the walls or in one of them; the first kind takes a way of its own."""
     lcs = cart_pole()
-    feedback = LinearFeedback(np.array([[0.1, 0.2, -0.9, -0.2]]), np.zeros(1), np.full(1, -5.0), np.full(1, 5.0))
+    feedback = LinearFeedback(np.array([[0.1, 0.2, -0.9, -0.2]]), np.zeros(1), np.full(1, -np.inf), np.full(1, np.inf))
     s0 = np.random.default_rng(0).uniform(-1, 1, (40, 4)) * [0.45, 0.5, 0.1, 0.5]
     rollout = LcsSimulator(arrays(lcs), feedback).regulated(s0, 5)
     touched = (rollout.forces > 0).any(axis=(1, 2))
