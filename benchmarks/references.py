@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -48,27 +49,33 @@ def lqr(env_id: str) -> Controller:
     return act
 
 
-def oracle(env_id: str) -> Controller:
+def oracle_controller(env_id: str, **settings: Any) -> LcsMpc:
     """The learned policy's controller with the true model and the true reward: "MPC with true dynamics".
 
     Horizon, penalty, scales and the like are the environment's tuned ones; untuned, states are scaled by the
     reset range.
 
     :param env_id: see :func:`cart_pole`
+    :param settings: of :class:`LcsMpc`, in place of the tuned ones
     """
     tuned = hyperparams(env_id).get("policy_kwargs", {})
     with cart_pole(env_id) as plant:
         space = plant.action_space
         assert isinstance(space, gym.spaces.Box)
-        controller = LcsMpc(
+        return LcsMpc(
             LinearComplementaritySystem.from_matrices(
                 *plant.true_lcs(), state_scale=tuned.get("state_scale", plant.reset_range)
             ),
             QuadraticReward(plant.state_weights, plant.action_weight * plant.max_force**2),
             space.low,
             space.high,
-            **{name: tuned[name] for name in CONTROLLER_SETTINGS if name in tuned},
+            **{name: tuned[name] for name in CONTROLLER_SETTINGS if name in tuned} | settings,
         )
+
+
+def oracle(env_id: str) -> Controller:
+    """:func:`oracle_controller`, as a controller to be scored."""
+    controller = oracle_controller(env_id)
 
     def act(observations: np.ndarray) -> np.ndarray:
         return controller.plan(observations).actions[:, 0]
