@@ -10,9 +10,12 @@ like size are padded to the largest among them and solved in one batched call, o
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 
-__all__ = ["active_constraints", "solve_on_active_set"]
+from sb3_mpc_policy.solvers.condensed import CondensedProblem
+
+__all__ = ["active_constraints", "exact_solution", "solve_on_active_set"]
 
 # A multiplier above this share of the largest counts its constraint as active.
 _ACTIVE = 1e-9
@@ -20,6 +23,8 @@ _ACTIVE = 1e-9
 _SHIFT = 1e-13
 # Problems a call: enough to hide the call's own cost, few enough that sizes within it are alike.
 _CHUNK = {"cpu": 128, "cuda": 2048}
+_CORRECTIONS = 8  # of a guessed active set
+_SIGN = 1e-10  # violations and multipliers up to this are none, relative to the problem's size
 
 
 def active_constraints(multipliers: torch.Tensor, n: int) -> tuple[torch.Tensor, torch.Tensor]:
@@ -47,6 +52,50 @@ def solve_on_active_set(
     for some in order.split(_CHUNK.get(Q.device.type, len(order) or 1)):
         x[some], nu[some] = _solve_padded(Q, G, free[some], on_gap[some], r[some], t[some])
     return x, nu
+
+
+def exact_solution(
+    condensed: CondensedProblem,
+    device: str,
+    f: np.ndarray,
+    g: np.ndarray,
+    at_low: torch.Tensor,
+    at_high: torch.Tensor,
+    on_gap: torch.Tensor,
+) -> tuple[np.ndarray, np.ndarray]:
+    """The solution on the active constraints: x (N, n) and multipliers (N, n + n_gaps).
+
+    What is violated then joins the set and what pulls leaves it, as in a primal-dual active-set method, until nothing
+    changes or the corrections are spent.
+    """
+
+    def tensor(array: np.ndarray) -> torch.Tensor:
+        return torch.as_tensor(array, device=device)
+
+    Q, G, low, high = (tensor(part) for part in (condensed.Q, condensed.G, condensed.low, condensed.high))
+    slope, offset = tensor(f), tensor(g)
+    size = _SIGN * (1.0 + slope.abs().amax(dim=1, keepdim=True))
+    result_x, result_bound, result_gap = torch.zeros_like(slope), torch.zeros_like(slope), torch.zeros_like(offset)
+    todo = torch.arange(len(slope), device=device)
+    for _ in range(1 + _CORRECTIONS):
+        some_f, some_g, tol = slope[todo], offset[todo], size[todo]
+        fixed = at_low | at_high
+        at = torch.where(at_low, low, torch.where(at_high, high, 0.0))
+        x, nu = solve_on_active_set(Q, G, ~fixed, on_gap, -(some_f + at @ Q), -(some_g + at @ G.mT))
+        x = torch.where(fixed, at, x)
+        mu = torch.where(fixed, -(some_f + x @ Q + nu @ G), 0.0)
+        result_x[todo], result_bound[todo], result_gap[todo] = x, mu, nu
+        now = (
+            torch.where(at_low, mu < tol, x < low - _SIGN),
+            torch.where(at_high, mu > -tol, x > high + _SIGN),
+            torch.where(on_gap, nu < tol, x @ G.mT + some_g < -_SIGN),
+        )
+        changed = torch.cat([now[0] != at_low, now[1] != at_high, now[2] != on_gap], dim=1).any(dim=1)
+        todo = todo[changed]
+        if not len(todo):
+            break
+        at_low, at_high, on_gap = (part[changed] for part in now)
+    return result_x.cpu().numpy(), torch.cat([result_bound, result_gap], dim=1).cpu().numpy()
 
 
 def _solve_padded(

@@ -12,6 +12,7 @@ from __future__ import annotations
 from functools import cached_property
 
 import numpy as np
+from scipy.linalg import lapack
 
 from sb3_mpc_policy.problem import ComplementarityWeights, RelaxedProblem
 from sb3_mpc_policy.solvers.base import Solution
@@ -106,6 +107,17 @@ class CondensedProblem:
         for k in range(H + 1):
             result[k:, :, k] = self._from_start[: H + 1 - k]
         return result.reshape((H + 1) * n_x, (H + 1) * n_x)
+
+    @cached_property
+    def condition(self) -> float:
+        """LAPACK's estimate of Q's condition number in the 1-norm; infinite where Q is not positive definite."""
+        if not np.isfinite(self.Q).all():
+            return np.inf
+        factor, failed = lapack.dpotrf(self.Q, lower=True)
+        if failed:
+            return np.inf
+        reciprocal, _ = lapack.dpocon(factor, np.abs(self.Q).sum(axis=0).max(), uplo="L")
+        return float(1.0 / reciprocal) if reciprocal > 0 else np.inf
 
     def residual(self, x: np.ndarray, multipliers: np.ndarray, f: np.ndarray, g: np.ndarray) -> np.ndarray:
         """Violation of the optimality conditions (N,), see check.py.

@@ -11,6 +11,7 @@ import torch
 
 from sb3_mpc_policy.lcs import LcsMatrices
 from sb3_mpc_policy.problem import ComplementarityWeights, RelaxedProblem
+from sb3_mpc_policy.solvers.active_set import active_constraints, exact_solution
 from sb3_mpc_policy.solvers.base import Solution, Solver
 from sb3_mpc_policy.solvers.condensed import CondensedProblem
 from sb3_mpc_policy.solvers.gradient import attach_gradient
@@ -25,6 +26,10 @@ _ATTEMPTS: dict[str, dict[str, float]] = {
     "plain": {"primal_tol": 1e-9},
     "proximal": {"primal_tol": 1e-9, "eps_prox": 1e-6},
 }
+# Where Q's condition is beyond this, and in the proximal form, digits are lost that show in the actions. The active set
+# is right or nearly so: the solution is then found again on it, and must meet the optimality conditions.
+_ILL_CONDITIONED = 1e10
+_SOLVED = 1e-8  # of the KKT residual
 # A solve lets go of Python's lock, the call around it does not: on fewer variables threads would wait for each other.
 _THREADED_SIZE = 60
 _LEAST_PER_THREAD = 16
@@ -39,6 +44,8 @@ class DaqpSolver(Solver):
     def __init__(self) -> None:
         self._condensed: CondensedProblem | None = None
         self._workspaces: list[_Workspace] = []
+        self.retries = 0
+        """Problems so far that the plain method did not solve."""
 
     def _prepare(self, problem: RelaxedProblem) -> CondensedProblem:
         if self._condensed is None or self._condensed.problem is not problem:
@@ -62,7 +69,24 @@ class DaqpSolver(Solver):
                 with ThreadPoolExecutor(threads) as pool:
                     shares = np.array_split(usable, threads)
                     list(pool.map(_Workspace.solve, self._workspaces, [batch] * threads, shares))
+            self.retries += int(batch.retried.sum())
+            doubtful = batch.retried | (condensed.condition > _ILL_CONDITIONED)
+            self._refine(condensed, batch, np.flatnonzero(batch.solved & doubtful))
         return condensed.expand(batch.x, s0, batch.solved, batch.multipliers)
+
+    @staticmethod
+    def _refine(condensed: CondensedProblem, batch: _Batch, index: np.ndarray) -> None:
+        """Find the solutions at ``index`` again, on their active sets, and keep the better ones."""
+        if not len(index):
+            return
+        f, g, multipliers = batch.slope[index], -batch.lower[index, condensed.n :], batch.multipliers[index]
+        free, on_gap = active_constraints(torch.as_tensor(multipliers), condensed.n)
+        at_low = ~free & torch.as_tensor(multipliers[:, : condensed.n] < 0)
+        x, exact = exact_solution(condensed, "cpu", f, g, at_low, ~free & ~at_low, on_gap)
+        before, after = condensed.residual(batch.x[index], multipliers, f, g), condensed.residual(x, exact, f, g)
+        better = after < before  # False for NaN
+        batch.x[index[better]], batch.multipliers[index[better]] = x[better], exact[better]
+        batch.solved[index] = np.where(better, after, before) < _SOLVED
 
     def differentiable_actions(
         self,
@@ -75,7 +99,7 @@ class DaqpSolver(Solver):
         return attach_gradient(self._prepare(problem), model, s0, weights, solution)
 
     def __getstate__(self) -> dict[str, object]:
-        return {"_condensed": None, "_workspaces": []}  # the C workspaces are rebuilt where they are needed
+        return {"_condensed": None, "_workspaces": [], "retries": self.retries}  # the C workspaces are rebuilt where they are needed
 
 
 class _Batch:
@@ -89,7 +113,7 @@ class _Batch:
         self.lower[:, n:] = -condensed.gap_offset(s0)
         self.guess = _guessed_active_set(condensed, weights)
         self.x, self.multipliers = np.zeros_like(self.slope), np.zeros_like(self.lower)
-        self.solved = np.zeros(len(s0), dtype=bool)
+        self.solved, self.retried = np.zeros((2, len(s0)), dtype=bool)
 
 
 class _Workspace:
@@ -103,7 +127,11 @@ class _Workspace:
 
     def solve(self, batch: _Batch, index: Iterable[int]) -> None:
         for i in index:
-            batch.solved[i] = any(self._attempt(attempt, batch, i) for attempt in _ATTEMPTS)
+            for attempt in _ATTEMPTS:
+                batch.solved[i] = self._attempt(attempt, batch, i)
+                if batch.solved[i]:
+                    break
+                batch.retried[i] = True
 
     def _attempt(self, attempt: str, batch: _Batch, i: int) -> bool:
         model = self._models.get(attempt)

@@ -17,7 +17,7 @@ import torch
 
 from sb3_mpc_policy.lcs import LcsMatrices
 from sb3_mpc_policy.problem import ComplementarityWeights, RelaxedProblem
-from sb3_mpc_policy.solvers.active_set import solve_on_active_set
+from sb3_mpc_policy.solvers.active_set import exact_solution
 from sb3_mpc_policy.solvers.base import Solution, Solver
 from sb3_mpc_policy.solvers.condensed import CondensedProblem
 from sb3_mpc_policy.solvers.daqp import DaqpSolver
@@ -28,9 +28,7 @@ __all__ = ["InteriorPointSolver"]
 _ITERATIONS = 30
 _TOLERANCE = 1e-7  # of the interior point, where it hands over to its active set
 _STEP = 0.995  # share of the way to the boundary
-_CORRECTIONS = 8  # of the active set
-_SIGN = 1e-10  # violations and multipliers up to this are none, relative to the problem's size
-_SOLVED = 1e-10  # of the KKT residual
+_SOLVED = 1e-12  # of the KKT residual: rounding alone leaves 1e-14
 _LARGEST_BATCH = 4096  # problems at a time, which bounds the memory
 
 
@@ -40,6 +38,8 @@ class InteriorPointSolver(Solver):
     def __init__(self) -> None:
         self._condensed: CondensedProblem | None = None
         self._active_set_method = DaqpSolver()
+        self.handed_over = 0
+        """Problems so far that went to the active-set method on the host."""
 
     def solve(self, problem: RelaxedProblem, s0: np.ndarray, weights: ComplementarityWeights) -> Solution:
         condensed = self._prepare(problem)
@@ -53,10 +53,11 @@ class InteriorPointSolver(Solver):
                 some = start + np.flatnonzero(usable[start : start + _LARGEST_BATCH])
                 those = ComplementarityWeights(weights.gap[some], weights.force[some])
                 low, high, gap = stages.active(s0[some], those)
-                x[some], multipliers[some] = _exact(condensed, problem.device, f[some], g[some], low, high, gap)
+                x[some], multipliers[some] = exact_solution(condensed, problem.device, f[some], g[some], low, high, gap)
                 solved[some] = condensed.residual(x[some], multipliers[some], f[some], g[some]) < _SOLVED
         solution = condensed.expand(x, s0, solved, multipliers)
         hard = np.flatnonzero(~solved & usable)
+        self.handed_over += len(hard)
         if len(hard):
             those = ComplementarityWeights(weights.gap[hard], weights.force[hard])
             solution.replace(hard, self._active_set_method.solve(problem, s0[hard], those))
@@ -78,7 +79,7 @@ class InteriorPointSolver(Solver):
         return self._condensed
 
     def __getstate__(self) -> dict[str, object]:
-        return {"_condensed": None, "_active_set_method": self._active_set_method}
+        return {"_condensed": None, "_active_set_method": self._active_set_method, "handed_over": self.handed_over}
 
 
 class _Batch(NamedTuple):
@@ -294,47 +295,3 @@ def _longest(point: _Point, move: _Point) -> torch.Tensor:
     value, change = torch.cat([point.y, point.z], dim=2), torch.cat([move.y, move.z], dim=2)
     ratio = torch.where(change < 0, -value / change, torch.inf)
     return ratio.amin(dim=(0, 2), keepdim=True).clamp(max=1.0)
-
-
-def _exact(
-    condensed: CondensedProblem,
-    device: str,
-    f: np.ndarray,
-    g: np.ndarray,
-    at_low: torch.Tensor,
-    at_high: torch.Tensor,
-    on_gap: torch.Tensor,
-) -> tuple[np.ndarray, np.ndarray]:
-    """The solution on the active constraints: x (N, n) and multipliers (N, n + n_gaps).
-
-    What is violated then joins the set and what pulls leaves it, as in a primal-dual active-set method, until nothing
-    changes or the corrections are spent.
-    """
-
-    def tensor(array: np.ndarray) -> torch.Tensor:
-        return torch.as_tensor(array, device=device)
-
-    Q, G, low, high = (tensor(part) for part in (condensed.Q, condensed.G, condensed.low, condensed.high))
-    slope, offset = tensor(f), tensor(g)
-    size = _SIGN * (1.0 + slope.abs().amax(dim=1, keepdim=True))
-    result_x, result_bound, result_gap = torch.zeros_like(slope), torch.zeros_like(slope), torch.zeros_like(offset)
-    todo = torch.arange(len(slope), device=device)
-    for _ in range(1 + _CORRECTIONS):
-        some_f, some_g, tol = slope[todo], offset[todo], size[todo]
-        fixed = at_low | at_high
-        at = torch.where(at_low, low, torch.where(at_high, high, 0.0))
-        x, nu = solve_on_active_set(Q, G, ~fixed, on_gap, -(some_f + at @ Q), -(some_g + at @ G.mT))
-        x = torch.where(fixed, at, x)
-        mu = torch.where(fixed, -(some_f + x @ Q + nu @ G), 0.0)
-        result_x[todo], result_bound[todo], result_gap[todo] = x, mu, nu
-        now = (
-            torch.where(at_low, mu < tol, x < low - _SIGN),
-            torch.where(at_high, mu > -tol, x > high + _SIGN),
-            torch.where(on_gap, nu < tol, x @ G.mT + some_g < -_SIGN),
-        )
-        changed = torch.cat([now[0] != at_low, now[1] != at_high, now[2] != on_gap], dim=1).any(dim=1)
-        todo = todo[changed]
-        if not len(todo):
-            break
-        at_low, at_high, on_gap = (part[changed] for part in now)
-    return result_x.cpu().numpy(), torch.cat([result_bound, result_gap], dim=1).cpu().numpy()
