@@ -30,6 +30,9 @@ __all__ = ["LcpSolver", "solve_lcp"]
 _MAX_TABULATED_CONTACTS = 4
 # Relative to the size of q: below it a negative entry is rounding error, not a violated inequality.
 _TOLERANCE = 1e-12
+# What rounding can take from F's least eigenvalue, relative to the largest entry. Beside entries of 1e16 the one that
+# makes F a P-matrix is lost, and F singular.
+_ROUNDING = 1e-14
 
 
 class LcpSolver:
@@ -39,7 +42,7 @@ class LcpSolver:
     """
 
     def __init__(self, F: np.ndarray) -> None:
-        self.F = np.asarray(F, dtype=np.float64)
+        self.F = _safe(np.asarray(F, dtype=np.float64))
         self.n = self.F.shape[0]
         self._modes: np.ndarray | None = None
         if 0 < self.n <= _MAX_TABULATED_CONTACTS:
@@ -68,6 +71,14 @@ class LcpSolver:
         best = np.minimum(forces, gaps).min(axis=2).argmax(axis=1)
         lam[closing], active[closing] = np.maximum(forces[np.arange(len(some)), best], 0.0), self._patterns[best]
         return lam, active
+
+
+def _safe(F: np.ndarray) -> np.ndarray:
+    """F, its diagonal raised where rounding has made it singular or worse."""
+    size = _ROUNDING * np.abs(F).max(initial=0.0)
+    if not np.isfinite(size) or np.linalg.eigvalsh(F + F.T).min(initial=np.inf) > size:
+        return F
+    return F + size * np.eye(len(F))
 
 
 def _mode_map(F: np.ndarray, active: np.ndarray) -> np.ndarray:
@@ -133,7 +144,7 @@ class _Lcp(torch.autograd.Function):
         # lam_a = -F_aa^{-1} q_a  =>  d lam_a = -F_aa^{-1} (dq_a + dF_aa lam_a)
         (F,) = ctx.saved_tensors
         rhs = np.where(ctx.active, -grad.cpu().numpy(), 0.0)
-        transposed = _masked(F.detach().cpu().numpy(), ctx.active).transpose(0, 2, 1)
+        transposed = _masked(_safe(F.detach().cpu().numpy()), ctx.active).transpose(0, 2, 1)
         adjoint = np.linalg.solve(transposed, rhs[..., None])[..., 0]
         return torch.as_tensor(adjoint.T @ ctx.lam, device=grad.device), torch.as_tensor(adjoint, device=grad.device)
 

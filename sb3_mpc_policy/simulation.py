@@ -30,6 +30,10 @@ class LinearFeedback(NamedTuple):
     high: np.ndarray
 
 
+# A model that explodes within the horizon ends in numbers that are not finite, which the controller recognises.
+_may_explode = np.errstate(over="ignore", invalid="ignore")
+
+
 class LcsSimulator:
     """Rollouts of one model, in whichever coordinates its matrices and the arguments share.
 
@@ -47,10 +51,12 @@ class LcsSimulator:
         self._push = np.vstack([C, F]).T.copy()
         self._maps: dict[int, np.ndarray] = {}  # by horizon
 
+    @_may_explode
     def under(self, s0: np.ndarray, actions: np.ndarray) -> LcsRollout:
         """s0: (N, n_x), actions: (N, H, n_a)"""
         return self._step_by_step(s0, actions.shape[1], actions, None)
 
+    @_may_explode
     def regulated(self, s0: np.ndarray, horizon: int) -> LcsRollout:
         """Under the feedback, from s0 (N, n_x).
 

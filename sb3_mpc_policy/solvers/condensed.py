@@ -19,6 +19,9 @@ from sb3_mpc_policy.solvers.base import Solution
 
 __all__ = ["CondensedProblem"]
 
+# What a model that explodes within the horizon leaves is not finite; the solvers reject it.
+_may_explode = np.errstate(over="ignore", invalid="ignore")
+
 
 class CondensedProblem:
     """Maps from x = (actions, forces) and s_0 to states, gaps and cost; built once for a batch.
@@ -26,6 +29,7 @@ class CondensedProblem:
     :param problem: what the batch shares
     """
 
+    @_may_explode
     def __init__(self, problem: RelaxedProblem) -> None:
         self.problem = problem
         A, B, C, d, D, E, F, c = problem.model
@@ -83,6 +87,7 @@ class CondensedProblem:
         self.low = np.concatenate([np.tile(problem.action_low, H), forces])
         self.high = np.concatenate([np.tile(problem.action_high, H), forces + np.inf])
 
+    @_may_explode
     def slope(self, s0: np.ndarray, weights: ComplementarityWeights) -> np.ndarray:
         """f (N, n)"""
         f = s0 @ self._slope_from_start.T + self._slope
@@ -91,6 +96,7 @@ class CondensedProblem:
             f[:, self.n_actions :] += weights.force.reshape(len(s0), len(self.G))
         return f
 
+    @_may_explode
     def gap_offset(self, s0: np.ndarray) -> np.ndarray:
         """g (N, H n_lambda), the gaps at x = 0"""
         return s0 @ self._gap_from_start.T + self._gap_offset
@@ -119,6 +125,7 @@ class CondensedProblem:
         reciprocal, _ = lapack.dpocon(factor, np.abs(self.Q).sum(axis=0).max(), uplo="L")
         return float(1.0 / reciprocal) if reciprocal > 0 else np.inf
 
+    @_may_explode
     def residual(self, x: np.ndarray, multipliers: np.ndarray, f: np.ndarray, g: np.ndarray) -> np.ndarray:
         """Violation of the optimality conditions (N,), see check.py.
 
@@ -142,6 +149,7 @@ class CondensedProblem:
         worst: np.ndarray = np.concatenate(parts, axis=1).max(axis=1)
         return worst / (1.0 + np.abs(f).max(axis=1))
 
+    @_may_explode
     def expand(self, x: np.ndarray, s0: np.ndarray, solved: np.ndarray, multipliers: np.ndarray) -> Solution:
         """x (N, n) back to actions, states, forces and gaps."""
         n_x, n_a, n_c = self.problem.sizes

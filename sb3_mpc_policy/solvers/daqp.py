@@ -23,8 +23,8 @@ _OPTIMAL = 1  # exit flag
 _ACTIVE_AT_LOWER = 1 | 2  # constraint flags
 # On a few ill-conditioned problems the plain method cycles; its proximal-point form solves those, at more iterations.
 _ATTEMPTS: dict[str, dict[str, float]] = {
-    "plain": {"primal_tol": 1e-9},
-    "proximal": {"primal_tol": 1e-9, "eps_prox": 1e-6},
+    "plain": {"primal_tol": 1e-9, "iter_limit": 3000},
+    "proximal": {"primal_tol": 1e-9, "iter_limit": 3000, "eps_prox": 1e-6},
 }
 # Where Q's condition is beyond this, and in the proximal form, digits are lost that show in the actions. The active set
 # is right or nearly so: the solution is then found again on it, and must meet the optimality conditions.
@@ -99,7 +99,8 @@ class DaqpSolver(Solver):
         return attach_gradient(self._prepare(problem), model, s0, weights, solution)
 
     def __getstate__(self) -> dict[str, object]:
-        return {"_condensed": None, "_workspaces": [], "retries": self.retries}  # the C workspaces are rebuilt where they are needed
+        # the C workspaces are rebuilt where they are needed
+        return {"_condensed": None, "_workspaces": [], "retries": self.retries}
 
 
 class _Batch:
