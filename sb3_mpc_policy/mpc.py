@@ -11,6 +11,11 @@ linearised product pushes down the gap where the nominal is in contact, and the 
 solves that convex problem, then simulates the LCS under the new actions; the simulation is the next nominal. Of all
 passes the plan whose simulation is cheapest is kept. The first nominal is the regulator (lqr.py) acting on the LCS.
 
+The first passes have a weak penalty: their plans may lean on forces that do not exist, and so find contacts that the
+nominal does not have. From pass to pass it stiffens, until forces and gaps exclude each other. What is then left to
+choose are contacts that merely touch: force and gap are both zero, the plan fits either mode, and the next pass tries
+the other one, which can only gain.
+
 The plan's derivative with respect to the model (eq 9 to 11) is that of the pass that was kept; nominal, weights,
 reward and terminal value are constants in it.
 """
@@ -37,8 +42,12 @@ __all__ = ["ControllerStatistics", "LcsMpc", "MpcPlan", "complementarity_weights
 # Relative to the mean stage weight. They keep every problem strictly convex and change no plan that matters.
 _FORCE_WEIGHT = 1e-4
 _LEAST_ACTION_WEIGHT = 1e-6
-# Change of a weight, relative to the penalty, below which a pass would repeat the one before.
-_SAME_WEIGHTS = 1e-3
+# The penalty's growth from pass to pass, and its end.
+_STIFFENING, _STIFFEST = 10.0, 1000.0
+# Relative difference of costs that is rounding.
+_SAME_COST = 1e-10
+# A gap, or a force in units of gap, below this (scaled coordinates) is zero as far as contact modes go.
+_TOUCHING = 1e-6
 # Forces and gaps up to this, in scaled coordinates, are none: the solvers' tolerance.
 _EXACT = 1e-9
 
@@ -106,9 +115,10 @@ class LcsMpc(nn.Module):
     :param action_high: (n_a,)
     :param horizon: H >= 1
     :param terminal_value: "riccati", "critic" or "none"
-    :param penalty: rho > 0, relative to the mean stage weight in scaled coordinates
+    :param penalty: rho > 0 of the first pass, relative to the mean stage weight in scaled coordinates; it grows
+        tenfold from pass to pass, up to a thousand times the first
     :param smoothing: epsilon >= 0, scaled coordinates
-    :param n_iterations: passes of the relaxation, >= 1
+    :param n_iterations: most passes of the relaxation, >= 1; a state whose next pass would change nothing has fewer
     :param solver: "auto", "daqp", "torch" or "cvxpylayers"
     :param check: whether every solution must meet the optimality conditions (solvers/check.py); one that does not is
         replaced like one that was not found
@@ -125,9 +135,9 @@ class LcsMpc(nn.Module):
         action_high: np.ndarray,
         horizon: int = 10,
         terminal_value: str = "riccati",
-        penalty: float = 1000.0,
-        smoothing: float = 1e-6,
-        n_iterations: int = 2,
+        penalty: float = 100.0,
+        smoothing: float = 0.0,
+        n_iterations: int = 6,
         solver: str = "auto",
         check: bool = False,
     ) -> None:
@@ -261,21 +271,22 @@ class LcsMpc(nn.Module):
     ) -> tuple[Solution, ComplementarityWeights, np.ndarray]:
         """The best pass for each of s0 (N, n_x): its solution, its weights, and its cost under the LCS itself."""
         nominal = self._first_nominal(problem, s0, previous)
-        weights = self._weights(problem, nominal)
-        best, best_cost, nominal = self._one_pass(problem, s0, weights)
-        best_weights = ComplementarityWeights(weights.gap.copy(), weights.force.copy())
+        weights = self._weights(problem, nominal, self._penalty(problem, 0))
+        solution, cost, nominal = self._one_pass(problem, s0, weights)
         todo = np.arange(len(s0))
-        for _ in range(self.n_iterations - 1):
-            following = self._weights(problem, nominal)
-            # only where the new nominal changed its contact mode does another pass solve another problem
-            changed = np.abs(following.gap - weights.gap).reshape(len(todo), -1).max(axis=1, initial=0.0)
-            again = np.flatnonzero(changed > _SAME_WEIGHTS * self._penalty(problem))
+        best, best_cost = solution[todo], cost.copy()
+        best_weights = ComplementarityWeights(weights.gap.copy(), weights.force.copy())
+        for number in range(1, self.n_iterations):
+            following = self._weights(problem, nominal, self._penalty(problem, number), weights)
+            again = np.flatnonzero(~_finished(problem, solution, weights, following))
             if not len(again):
                 break
             todo = todo[again]
             weights = ComplementarityWeights(following.gap[again], following.force[again])
             solution, cost, nominal = self._one_pass(problem, s0[todo], weights)
-            better = solution.solved & (~best.solved[todo] | (cost < best_cost[todo]))
+            # of two that cost the same, the stiffer: it leans less on forces that do not exist
+            enough = best_cost[todo] + _SAME_COST * np.abs(best_cost[todo])
+            better = solution.solved & (~best.solved[todo] | (cost <= enough))
             best.replace(todo[better], solution[better])
             best_cost[todo[better]] = cost[better]
             best_weights.gap[todo[better]] = weights.gap[better]
@@ -314,12 +325,29 @@ class LcsMpc(nn.Module):
                 mine[better] = other[better]
         return nominal
 
-    def _penalty(self, problem: RelaxedProblem) -> float:
-        return self.penalty * _mean_weight(problem.stage_weight)
+    def _penalty(self, problem: RelaxedProblem, number: int) -> float:
+        """rho of a pass: ten times stiffer from pass to pass, up to a thousandfold."""
+        return self.penalty * min(_STIFFENING**number, _STIFFEST) * _mean_weight(problem.stage_weight)
 
-    def _weights(self, problem: RelaxedProblem, nominal: LcsRollout) -> ComplementarityWeights:
+    def _weights(
+        self,
+        problem: RelaxedProblem,
+        nominal: LcsRollout,
+        penalty: float,
+        before: ComplementarityWeights | None = None,
+    ) -> ComplementarityWeights:
+        """Weights around a nominal; where it only touches, the mode that the pass before (``before``) did not have.
+
+        Both modes allow a plan that touches, so the next pass can only gain by the change.
+        """
         stiffness = np.diag(problem.model.F)
-        return complementarity_weights(nominal.forces, nominal.gaps, stiffness, self._penalty(problem), self.smoothing)
+        weights = complementarity_weights(nominal.forces, nominal.gaps, stiffness, penalty, self.smoothing)
+        if before is not None:
+            touching = (nominal.forces * stiffness < _TOUCHING) & (nominal.gaps < _TOUCHING)
+            contact = ~_in_contact(problem, before)
+            weights.gap[touching] = np.where(contact, penalty, 0.0)[touching]
+            weights.force[touching] = np.where(contact, 0.0, penalty * stiffness)[touching]
+        return weights
 
     def _stand_in(self, problem: RelaxedProblem, solution: Solution, s0: np.ndarray) -> None:
         """Put the regulator's plan, simulated on the LCS, where the solver failed; a zero action if even that fails."""
@@ -410,6 +438,25 @@ class LcsMpc(nn.Module):
 def _mean_weight(W: np.ndarray) -> float:
     """The size of the cost in scaled coordinates, to which penalty and regularisation are relative."""
     return max(float(np.trace(W)) / len(W), 1e-12)
+
+
+def _in_contact(problem: RelaxedProblem, weights: ComplementarityWeights) -> np.ndarray:
+    """(N, H, n_lambda) the mode that the weights ask for: whether they push the gap down rather than the force."""
+    return weights.gap * np.diag(problem.model.F) > weights.force
+
+
+def _finished(
+    problem: RelaxedProblem, solution: Solution, weights: ComplementarityWeights, following: ComplementarityWeights
+) -> np.ndarray:
+    """(N,) whether the following, stiffer pass would find the same solution again, or this one found none.
+
+    It is the same where both ask for one mode, and nothing is left of what they push down.
+    """
+    mode = _in_contact(problem, weights)
+    left = np.where(mode, solution.gaps, solution.forces * np.diag(problem.model.F))
+    done = (mode == _in_contact(problem, following)) & (left < _TOUCHING)
+    result: np.ndarray = done.all(axis=(1, 2)) | ~solution.solved
+    return result
 
 
 def _complementarity(solution: Solution) -> np.ndarray:

@@ -59,9 +59,9 @@ class MpcLcsPolicy(ActorCriticPolicy):
     :param n_contacts: n_lambda >= 0
     :param reward: a :class:`QuadraticReward`, or its arguments as a dict; None to learn one from the rewards observed
     :param terminal_value: "riccati", "critic" or "none"
-    :param penalty: rho of the relaxation, relative to the size of the cost
+    :param penalty: rho of the relaxation's first pass, relative to the size of the cost; it stiffens from pass to pass
     :param smoothing: epsilon of the relaxation, scaled coordinates
-    :param n_iterations: passes of the relaxation
+    :param n_iterations: most passes of the relaxation
     :param solver: "auto", "daqp", "torch" or "cvxpylayers"
     :param check: whether every solution must meet the optimality conditions; the regulator stands in for one that
         does not
@@ -95,9 +95,9 @@ class MpcLcsPolicy(ActorCriticPolicy):
         n_contacts: int = 2,
         reward: QuadraticReward | dict[str, Any] | None = None,
         terminal_value: str = "riccati",
-        penalty: float = 1000.0,
-        smoothing: float = 1e-6,
-        n_iterations: int = 2,
+        penalty: float = 100.0,
+        smoothing: float = 0.0,
+        n_iterations: int = 6,
         solver: str = "auto",
         check: bool = False,
         prediction_coef: float = 100.0,
