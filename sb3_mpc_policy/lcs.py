@@ -18,9 +18,9 @@ import numpy as np
 import torch
 from torch import nn
 
-from sb3_mpc_policy.lcp import LcpSolver, solve_lcp
+from sb3_mpc_policy.lcp import solve_lcp
 
-__all__ = ["LcsMatrices", "LcsRollout", "LinearComplementaritySystem", "simulate"]
+__all__ = ["LcsMatrices", "LinearComplementaritySystem"]
 
 # Least eigenvalue of the symmetric part of F in scaled coordinates, relative to gaps and forces of size one.
 KAPPA = 1e-3
@@ -41,15 +41,6 @@ class LcsMatrices(NamedTuple, Generic[Matrix]):
     E: Matrix
     F: Matrix
     c: Matrix
-
-
-class LcsRollout(NamedTuple):
-    """A simulated trajectory: states (N, H+1, n_x), actions (N, H, n_a), forces and gaps (N, H, n_lambda)."""
-
-    states: np.ndarray
-    actions: np.ndarray
-    forces: np.ndarray
-    gaps: np.ndarray
 
 
 class LinearComplementaritySystem(nn.Module):
@@ -267,44 +258,3 @@ class LinearComplementaritySystem(nn.Module):
 
     def extra_repr(self) -> str:
         return f"n_states={self.n_states}, n_actions={self.n_actions}, n_contacts={self.n_contacts}"
-
-
-def simulate(
-    model: LcsMatrices[np.ndarray],
-    lcp: LcpSolver,
-    s0: np.ndarray,
-    actions: np.ndarray | None = None,
-    *,
-    horizon: int | None = None,
-    feedback: tuple[np.ndarray, np.ndarray] | None = None,
-    bounds: tuple[np.ndarray, np.ndarray] | None = None,
-) -> LcsRollout:
-    """Roll eq (5) out from s0 (N, n_x), under given actions (N, H, n_a) or under feedback ``a = clip(K s + k)``.
-
-    Plain NumPy without gradients, in whichever coordinates the arguments share.
-    """
-    A, B, C, d, D, E, F, c = model
-    steps = actions.shape[1] if actions is not None else int(horizon or 0)
-    n = len(s0)
-    states = np.empty((n, steps + 1, len(A)))
-    taken = np.empty((n, steps, B.shape[1]))
-    forces = np.empty((n, steps, len(c)))
-    gaps = np.empty_like(forces)
-    states[:, 0] = s0
-    for k in range(steps):
-        s = states[:, k]
-        if actions is not None:
-            a = actions[:, k]
-        elif feedback is not None and bounds is not None:
-            a = np.clip(s @ feedback[0].T + feedback[1], *bounds)
-        else:
-            raise ValueError("simulate needs actions, or feedback with bounds")
-        taken[:, k] = a
-        states[:, k + 1] = s @ A.T + a @ B.T + d
-        if len(c):
-            q = s @ D.T + a @ E.T + c
-            lam, _ = lcp(q)
-            forces[:, k] = lam
-            gaps[:, k] = q + lam @ F.T
-            states[:, k + 1] += lam @ C.T
-    return LcsRollout(states, taken, forces, gaps)
