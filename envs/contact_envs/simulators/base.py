@@ -7,14 +7,16 @@ from abc import ABC, abstractmethod
 import numpy as np
 from numpy.typing import NDArray
 
-from contact_envs.dynamics import CartPoleParameters
+from contact_envs.plants import Plant
 
 
 class Simulator(ABC):
-    """A cart-pole between two soft walls inside a physics engine.
+    """A plant inside a physics engine, built from its :meth:`~contact_envs.plants.Plant.mechanism`.
 
-    The contact is the engine's own: a sphere at the pole's tip against a compliant wall. Only that pair
-    collides, and neither friction nor damping acts anywhere.
+    Walls are the engine's own contact: a sphere at the last link's tip against a compliant wall, the only
+    pair that collides. A joint's stops are a spring's torque, computed by the engine's blocks or next to it
+    from the state at the beginning of each physics step: an engine's own joint limits are as hard as its time
+    step allows, not as soft as one asks for. There is no friction anywhere.
 
     A simulator is a function of the last ``reset`` and the forces since: the same calls give the same
     numbers, bit for bit, whatever ran before. Several simulators in one process do not disturb each other.
@@ -25,9 +27,7 @@ class Simulator(ABC):
     :param viewer: open the engine's own window (see :meth:`show`)
     """
 
-    def __init__(
-        self, parameters: CartPoleParameters, physics_step: float, substeps: int, viewer: bool = False
-    ) -> None:
+    def __init__(self, parameters: Plant, physics_step: float, substeps: int, viewer: bool = False) -> None:
         self.parameters = parameters
         self.physics_step = physics_step
         self.substeps = substeps
@@ -37,16 +37,16 @@ class Simulator(ABC):
     def reset(self, state: NDArray[np.float64]) -> None:
         """Start from a state.
 
-        :param state: (4,) x, x_dot, theta, theta_dot; SI units
+        :param state: (4,) in the plant's order, SI units
         """
 
     @abstractmethod
     def step(self, force: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Advance by one control step under a constant force.
 
-        :param force: horizontal force on the cart, N
-        :return: the state (4,) at the end, and the forces (2,) of the right and left wall on the tip in N, as
-            the engine's contact solver found them, averaged over the control step; both >= 0
+        :param force: of the actuator, N or N m
+        :return: the state (4,) at the end, and the forces (2,) of the right and the left contact in N or N m,
+            as they acted in the engine, averaged over the control step; both >= 0
         """
 
     @abstractmethod

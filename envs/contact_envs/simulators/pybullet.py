@@ -1,8 +1,9 @@
-"""The cart-pole in PyBullet: a multibody in reduced coordinates with spring contact."""
+"""A plant in PyBullet: a multibody in reduced coordinates with spring contact."""
 
 from __future__ import annotations
 
 import ctypes
+import math
 import os
 import sys
 import weakref
@@ -10,7 +11,7 @@ import weakref
 import numpy as np
 from numpy.typing import NDArray
 
-from contact_envs.dynamics import CartPoleParameters
+from contact_envs.plants import JointStops, Link, Plant, TipWalls
 from contact_envs.simulators.base import Simulator
 
 try:
@@ -31,44 +32,61 @@ CART_COLOUR = (0.17, 0.24, 0.31, 1.0)
 POLE_COLOUR = (0.80, 0.36, 0.20, 1.0)
 WALL_COLOUR = (0.95, 0.77, 0.20, 0.7)
 
-CART, POLE = 0, 1  # joints, and the links they carry
+ROD_RADIUS = 0.008  # m, in the window
+
+_JOINTS = {
+    "slide": (pybullet.JOINT_PRISMATIC, [1.0, 0.0, 0.0]),
+    "hinge": (pybullet.JOINT_REVOLUTE, [0.0, 1.0, 0.0]),
+}
 
 
 class PyBulletSimulator(Simulator):
     """See :class:`Simulator`. Each one has a physics server of its own."""
 
-    def __init__(
-        self, parameters: CartPoleParameters, physics_step: float, substeps: int, viewer: bool = False
-    ) -> None:
+    def __init__(self, parameters: Plant, physics_step: float, substeps: int, viewer: bool = False) -> None:
         super().__init__(parameters, physics_step, substeps, viewer)
+        mechanism = parameters.mechanism()
         self._client = _open_window() if viewer else pybullet.connect(pybullet.DIRECT)
         # Also for a simulator that nobody closed: a process has a limited number of servers.
         self._disconnect = weakref.finalize(self, pybullet.disconnect, self._client)
-        pybullet.setGravity(0.0, 0.0, -parameters.gravity, physicsClientId=self._client)
+        pybullet.setGravity(0.0, 0.0, -mechanism.gravity, physicsClientId=self._client)
         # Without warm starts, so that no contact of the last episode can reach into the next one.
         pybullet.setPhysicsEngineParameter(
             fixedTimeStep=physics_step,
             warmStartingFactor=0.0,
             physicsClientId=self._client,
         )
-        self._walls = [_add_wall(parameters, side, viewer, self._client) for side in (1.0, -1.0)]
-        self._cart_pole = _add_cart_pole(parameters, viewer, self._client)
+        self._actuated = mechanism.actuated
+        self._contact: _Walls | _Stops
+        if isinstance(mechanism.contact, TipWalls):
+            self._contact = _Walls(mechanism.contact, viewer, self._client)
+            self._body = _add_chain(mechanism.links, viewer, self._client, self._contact.sphere)
+            self._contact.touch(self._body, len(mechanism.links) - 1)
+        else:
+            self._body = _add_chain(mechanism.links, viewer, self._client)
+            self._contact = _Stops(mechanism.contact, self._body, self._client)
+        self._joints = tuple(range(len(mechanism.links)))
 
     def reset(self, state: NDArray[np.float64]) -> None:
-        x, x_dot, theta, theta_dot = state.tolist()
-        pybullet.resetJointState(self._cart_pole, CART, x, x_dot, physicsClientId=self._client)
-        pybullet.resetJointState(self._cart_pole, POLE, theta, theta_dot, physicsClientId=self._client)
+        positions, velocities = state[[*self.parameters.POSITIONS]], state[[*self.parameters.VELOCITIES]]
+        for joint, position, velocity in zip(self._joints, positions.tolist(), velocities.tolist(), strict=True):
+            pybullet.resetJointState(self._body, joint, position, velocity, physicsClientId=self._client)
 
     def step(self, force: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        client, body = self._client, self._cart_pole
-        total = [0.0, 0.0]
+        client, body, contact = self._client, self._body, self._contact
+        total = np.zeros(2)
         for _ in range(self.substeps):
-            pybullet.setJointMotorControl2(body, CART, pybullet.TORQUE_CONTROL, force=force, physicsClientId=client)
+            pybullet.setJointMotorControl2(
+                body, self._actuated, pybullet.TORQUE_CONTROL, force=force, physicsClientId=client
+            )
+            contact.before_step(total)
             pybullet.stepSimulation(physicsClientId=client)
-            for contact in pybullet.getContactPoints(body, physicsClientId=client):
-                total[self._walls.index(contact[2])] += contact[9]
-        (x, x_dot, *_), (theta, theta_dot, *_) = pybullet.getJointStates(body, (CART, POLE), physicsClientId=client)
-        return np.array([x, x_dot, theta, theta_dot]), np.array(total) / self.substeps
+            contact.after_step(total)
+        state = np.empty(2 * len(self._joints))
+        joint_states = pybullet.getJointStates(body, self._joints, physicsClientId=client)
+        state[[*self.parameters.POSITIONS]] = [joint[0] for joint in joint_states]
+        state[[*self.parameters.VELOCITIES]] = [joint[1] for joint in joint_states]
+        return state, total / self.substeps
 
     def show(self) -> None:
         """PyBullet's window draws by itself."""
@@ -105,7 +123,61 @@ def _x_display_opens() -> bool:
     return True
 
 
-def _add_wall(parameters: CartPoleParameters, side: float, visible: bool, client: int) -> int:
+class _Walls:
+    """The engine's own contact between a sphere on the last link and two fixed half-spaces."""
+
+    def __init__(self, walls: TipWalls, visible: bool, client: int) -> None:
+        self._client = client
+        self._stiffness = walls.stiffness
+        self._faces = [_add_wall(walls, side, visible, client) for side in (1.0, -1.0)]
+        self.sphere = pybullet.createCollisionShape(
+            pybullet.GEOM_SPHERE,
+            radius=walls.radius,
+            collisionFramePosition=[0.0, 0.0, walls.height],
+            physicsClientId=client,
+        )
+        self._body = -1
+
+    def touch(self, body: int, link: int) -> None:
+        """Take the link that carries the sphere for what the walls push."""
+        self._body = body
+        _make_elastic(body, link, self._stiffness * TIP_STIFFNESS_RATIO, self._client)
+
+    def before_step(self, total: NDArray[np.float64]) -> None:
+        """The engine finds the forces itself."""
+
+    def after_step(self, total: NDArray[np.float64]) -> None:
+        """Add what the walls pushed with in the last physics step."""
+        for contact in pybullet.getContactPoints(self._body, physicsClientId=self._client):
+            total[self._faces.index(contact[2])] += contact[9]
+
+
+class _Stops:
+    """One-sided springs on the first joint, from its angle where a physics step begins."""
+
+    def __init__(self, stops: JointStops, body: int, client: int) -> None:
+        self._stops, self._body, self._client = stops, body, client
+
+    def before_step(self, total: NDArray[np.float64]) -> None:
+        """Push the joint back if it is out of range, and add that to the total."""
+        angle = pybullet.getJointState(self._body, 0, physicsClientId=self._client)[0]
+        depth = abs(angle) - self._stops.angle
+        if depth > 0.0:
+            torque = self._stops.stiffness * depth
+            total[0 if angle > 0.0 else 1] += torque
+            pybullet.setJointMotorControl2(
+                self._body,
+                0,
+                pybullet.TORQUE_CONTROL,
+                force=-math.copysign(torque, angle),
+                physicsClientId=self._client,
+            )
+
+    def after_step(self, total: NDArray[np.float64]) -> None:
+        """Nothing: the engine knows of no contact here."""
+
+
+def _add_wall(walls: TipWalls, side: float, visible: bool, client: int) -> int:
     """A fixed half-space whose face the tip's sphere touches when its centre is at the wall."""
     shape = pybullet.createCollisionShape(pybullet.GEOM_PLANE, planeNormal=[-side, 0.0, 0.0], physicsClientId=client)
     look = -1
@@ -113,77 +185,72 @@ def _add_wall(parameters: CartPoleParameters, side: float, visible: bool, client
         look = pybullet.createVisualShape(
             pybullet.GEOM_BOX,
             halfExtents=[0.05, 0.15, 0.3],
-            visualFramePosition=[side * 0.05, 0.0, parameters.pole_length],
+            visualFramePosition=[side * 0.05, 0.0, walls.height],
             rgbaColor=WALL_COLOUR,
             physicsClientId=client,
         )
-    face = side * (parameters.wall_distance + parameters.tip_radius)
     wall = pybullet.createMultiBody(
         baseCollisionShapeIndex=shape,
         baseVisualShapeIndex=look,
-        basePosition=[face, 0.0, 0.0],
+        basePosition=[side * (walls.distance + walls.radius), 0.0, 0.0],
         physicsClientId=client,
     )
-    _make_elastic(wall, -1, parameters.wall_stiffness, client)
+    _make_elastic(wall, -1, walls.stiffness, client)
     return wall
 
 
-def _cart_pole_looks(parameters: CartPoleParameters, client: int) -> list[int]:
-    """What the window shows of the cart and the pole; nothing here touches the physics."""
-    cart = pybullet.createVisualShape(
-        pybullet.GEOM_BOX, halfExtents=[0.12, 0.08, 0.05], rgbaColor=CART_COLOUR, physicsClientId=client
-    )
-    pole = pybullet.createVisualShape(
+def _look(link: Link, client: int) -> int:
+    """What the window shows of a link; nothing here touches the physics."""
+    if link.joint == "slide":
+        return pybullet.createVisualShape(
+            pybullet.GEOM_BOX, halfExtents=[0.12, 0.08, 0.05], rgbaColor=CART_COLOUR, physicsClientId=client
+        )
+    return pybullet.createVisualShape(
         pybullet.GEOM_CYLINDER,
-        radius=0.4 * parameters.tip_radius,
-        length=parameters.pole_length,
-        visualFramePosition=[0.0, 0.0, 0.5 * parameters.pole_length],
+        radius=ROD_RADIUS,
+        length=link.length,
+        visualFramePosition=[0.0, 0.0, 0.5 * link.length],
         rgbaColor=POLE_COLOUR,
         physicsClientId=client,
     )
-    return [cart, pole]
 
 
-def _add_cart_pole(parameters: CartPoleParameters, visible: bool, client: int) -> int:
-    """Cart on a rail along x, pole on a hinge about y, both point masses, and the tip's sphere."""
-    tip = pybullet.createCollisionShape(
-        pybullet.GEOM_SPHERE,
-        radius=parameters.tip_radius,
-        collisionFramePosition=[0.0, 0.0, parameters.pole_length],
-        physicsClientId=client,
-    )
-    centre = [0.0, 0.0, parameters.mass_centre]
-    origin, upright = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]
+def _add_chain(links: tuple[Link, ...], visible: bool, client: int, last_shape: int = -1) -> int:
+    """The links on their joints, the first one's on the world; only the last one has a collision shape."""
+    joints = [_JOINTS[link.joint] for link in links]
+    upright = [[0.0, 0.0, 0.0, 1.0]] * len(links)
+    centres = [[0.0, 0.0, link.mass_centre] for link in links]
     body = pybullet.createMultiBody(
         baseMass=0.0,
-        linkMasses=[parameters.cart_mass, parameters.pole_mass],
-        linkCollisionShapeIndices=[-1, tip],
-        linkVisualShapeIndices=_cart_pole_looks(parameters, client) if visible else [-1, -1],
-        linkPositions=[origin, origin],
-        linkOrientations=[upright, upright],
-        linkInertialFramePositions=[origin, centre],
-        linkInertialFrameOrientations=[upright, upright],
-        linkParentIndices=[0, 1],
-        linkJointTypes=[pybullet.JOINT_PRISMATIC, pybullet.JOINT_REVOLUTE],
-        linkJointAxis=[[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]],
+        linkMasses=[link.mass for link in links],
+        linkCollisionShapeIndices=[-1] * (len(links) - 1) + [last_shape],
+        linkVisualShapeIndices=[_look(link, client) if visible else -1 for link in links],
+        linkPositions=[[0.0, 0.0, link.height] for link in links],
+        linkOrientations=upright,
+        linkInertialFramePositions=centres,
+        linkInertialFrameOrientations=upright,
+        linkParentIndices=list(range(len(links))),
+        linkJointTypes=[kind for kind, _ in joints],
+        linkJointAxis=[axis for _, axis in joints],
         physicsClientId=client,
     )
-    for link in (CART, POLE):
+    for index, link in enumerate(links):
         pybullet.changeDynamics(
             body,
-            link,
+            index,
             linearDamping=0.0,
             angularDamping=0.0,
-            jointDamping=0.0,
             maxJointVelocity=MAX_JOINT_VELOCITY,
             physicsClientId=client,
         )
-        # Point masses: without this the pole would have the inertia of its sphere. In a call of its own,
-        # because PyBullet 3.2.7 forgets it when maxJointVelocity comes along.
-        pybullet.changeDynamics(body, link, localInertiaDiagonal=[0.0, 0.0, 0.0], physicsClientId=client)
-    for joint in (CART, POLE):  # PyBullet brakes every joint with a velocity motor unless told otherwise
-        pybullet.setJointMotorControl2(body, joint, pybullet.VELOCITY_CONTROL, force=0.0, physicsClientId=client)
-    _make_elastic(body, POLE, parameters.wall_stiffness * TIP_STIFFNESS_RATIO, client)
+        # Without this a link would have the inertia of its shape. In a call of its own, because PyBullet
+        # 3.2.7 forgets both when maxJointVelocity comes along.
+        across = [link.inertia, link.inertia, 0.0]
+        pybullet.changeDynamics(
+            body, index, localInertiaDiagonal=across, jointDamping=link.damping, physicsClientId=client
+        )
+        # PyBullet brakes every joint with a velocity motor unless told otherwise.
+        pybullet.setJointMotorControl2(body, index, pybullet.VELOCITY_CONTROL, force=0.0, physicsClientId=client)
     return body
 
 
