@@ -140,11 +140,12 @@ class _Workspace:
             model = daqp.Model()
             model.settings = _ATTEMPTS[attempt]
             flag, _ = model.setup(self._Q, batch.slope[i], self._G, self._upper, batch.lower[i], batch.guess[i])
-            if flag >= 0:  # a workspace that was refused must not be updated
-                self._models[attempt] = model
-        else:
-            flag = model.update(f=batch.slope[i], blower=batch.lower[i], sense=batch.guess[i])
-        if flag < 0:
+            if flag < 0:  # a workspace that was refused must not be updated
+                return False
+            self._models[attempt] = model
+        # The first problem too: set up without an update, its solution would differ in the last bits from that of the
+        # same problem solved later, and a copied policy from its original.
+        if model.update(f=batch.slope[i], blower=batch.lower[i], sense=batch.guess[i]) < 0:
             return False
         batch.x[i], _, flag, info = model.solve()
         batch.multipliers[i] = info["lam"]
