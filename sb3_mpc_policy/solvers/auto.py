@@ -42,16 +42,28 @@ def choose(device: str, batch: int, horizon: int) -> str:
 
 
 class AutomaticSolver(Solver):
-    """Hands each batch to the solver that :func:`choose` names."""
+    """Hands each batch to the solver that :func:`choose` names, and the problems that it cannot solve to the other."""
 
     def __init__(self) -> None:
-        self._solvers: dict[str, Solver] = {"daqp": DaqpSolver(), "torch": InteriorPointSolver()}
+        self.active_set_method, self.interior_point = DaqpSolver(), InteriorPointSolver()
+        self.handed_over = 0
+        """Problems so far that the active-set method did not solve."""
 
     def _for(self, problem: RelaxedProblem, batch: int) -> Solver:
-        return self._solvers[choose(torch.device(problem.device).type, batch, problem.horizon)]
+        name = choose(torch.device(problem.device).type, batch, problem.horizon)
+        return self.interior_point if name == "torch" else self.active_set_method
 
     def solve(self, problem: RelaxedProblem, s0: np.ndarray, weights: ComplementarityWeights) -> Solution:
-        return self._for(problem, len(s0)).solve(problem, s0, weights)
+        chosen = self._for(problem, len(s0))
+        solution = chosen.solve(problem, s0, weights)
+        if chosen is self.interior_point:  # which hands over by itself
+            return solution
+        hard = np.flatnonzero(~solution.solved)
+        self.handed_over += len(hard)
+        if len(hard):
+            those = ComplementarityWeights(weights.gap[hard], weights.force[hard])
+            solution.replace(hard, self.interior_point.solve_alone(problem, s0[hard], those))
+        return solution
 
     def differentiable_actions(
         self,

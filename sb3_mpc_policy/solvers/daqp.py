@@ -29,7 +29,7 @@ _ATTEMPTS: dict[str, dict[str, float]] = {
 # Where Q's condition is beyond this, and in the proximal form, digits are lost that show in the actions. The active set
 # is right or nearly so: the solution is then found again on it, and must meet the optimality conditions.
 _ILL_CONDITIONED = 1e10
-_SOLVED = 1e-8  # of the KKT residual
+_SOLVED = 1e-12  # of the KKT residual: a right active set leaves 1e-15, and 1e-10 has been seen beside wrong actions
 # A solve lets go of Python's lock, the call around it does not: on fewer variables threads would wait for each other.
 _THREADED_SIZE = 60
 _LEAST_PER_THREAD = 16

@@ -42,6 +42,16 @@ class InteriorPointSolver(Solver):
         """Problems so far that went to the active-set method on the host."""
 
     def solve(self, problem: RelaxedProblem, s0: np.ndarray, weights: ComplementarityWeights) -> Solution:
+        solution = self.solve_alone(problem, s0, weights)
+        hard = np.flatnonzero(~solution.solved)
+        self.handed_over += len(hard)
+        if len(hard):
+            those = ComplementarityWeights(weights.gap[hard], weights.force[hard])
+            solution.replace(hard, self._active_set_method.solve(problem, s0[hard], those))
+        return solution
+
+    def solve_alone(self, problem: RelaxedProblem, s0: np.ndarray, weights: ComplementarityWeights) -> Solution:
+        """Without handing over what this method cannot solve."""
         condensed = self._prepare(problem)
         f, g = condensed.slope(s0, weights), condensed.gap_offset(s0)
         x, multipliers = np.zeros_like(f), np.zeros((len(f), condensed.n + len(condensed.G)))
@@ -55,13 +65,7 @@ class InteriorPointSolver(Solver):
                 low, high, gap = stages.active(s0[some], those)
                 x[some], multipliers[some] = exact_solution(condensed, problem.device, f[some], g[some], low, high, gap)
                 solved[some] = condensed.residual(x[some], multipliers[some], f[some], g[some]) < _SOLVED
-        solution = condensed.expand(x, s0, solved, multipliers)
-        hard = np.flatnonzero(~solved & usable)
-        self.handed_over += len(hard)
-        if len(hard):
-            those = ComplementarityWeights(weights.gap[hard], weights.force[hard])
-            solution.replace(hard, self._active_set_method.solve(problem, s0[hard], those))
-        return solution
+        return condensed.expand(x, s0, solved, multipliers)
 
     def differentiable_actions(
         self,
