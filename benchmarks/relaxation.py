@@ -41,6 +41,9 @@ SEED = 2_000_000
 NEAR_WALL = 0.05
 """m between tip and wall, on either side of it."""
 
+HORIZON = 10
+"""Of every controller here: with a longer one, proofs of optimality take minutes a state."""
+
 LATEST_VISIT = 50
 """Control steps of an episode within which a state is taken from it."""
 
@@ -132,7 +135,7 @@ def start_states(env_id: str, n: int, seed: int = SEED) -> np.ndarray:
 
 def controller(env_id: str, setting: Setting) -> LcsMpc:
     """The oracle's controller with one setting changed."""
-    result = oracle_controller(env_id, **setting.arguments)
+    result = oracle_controller(env_id, horizon=HORIZON, **setting.arguments)
     result.__class__ = setting.controller  # a class with the same attributes
     return result
 
@@ -144,7 +147,7 @@ def optima(env_id: str, states: np.ndarray, known: np.ndarray, jobs: int) -> lis
     :param known: (N, H, n_a) a good plan from each, environment units
     :param jobs: processes
     """
-    plain = oracle_controller(env_id)
+    plain = oracle_controller(env_id, horizon=HORIZON)
     problem = plain._current_problem()
     s0 = states / plain.lcs.state_scale.numpy()
     inside = np.clip(known / plain.lcs.action_scale.numpy(), problem.action_low, problem.action_high)  # of rounding
@@ -172,7 +175,7 @@ def measure(env_id: str, n_states: int, jobs: int, repeats: int = 5) -> list[Row
     best = np.argmin([plan.cost for plan in plans], axis=0)
     found = optima(env_id, states, np.array([plans[j].actions[i] for i, j in enumerate(best)]), jobs)
 
-    plain = oracle_controller(env_id)
+    plain = oracle_controller(env_id, horizon=HORIZON)
     plain._current_problem()
     s0 = states / plain.lcs.state_scale.numpy()
     touched = (plain._simulator.under(s0, np.array([optimum.actions for optimum in found])).forces > 0.0).any(

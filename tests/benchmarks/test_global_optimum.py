@@ -114,7 +114,7 @@ def test_nor_is_one_of_a_random_model_with_drift_slopes_and_two_actions(seed: in
 
 
 def test_a_plan_that_is_already_the_best_is_proven_and_a_bad_one_is_beaten() -> None:
-    controller = oracle_controller(ENVS[0])
+    controller = oracle_controller(ENVS[0], horizon=relaxation.HORIZON)
     problem, s0 = problem_of(controller), STATES[1] / controller.lcs.state_scale.numpy()
     first = global_optimum(problem, s0, np.zeros((problem.horizon, 1)))
     assert first.proven and first.cost < 0.9 * cost_of(problem, s0, np.zeros((problem.horizon, 1)))
@@ -124,7 +124,7 @@ def test_a_plan_that_is_already_the_best_is_proven_and_a_bad_one_is_beaten() -> 
 
 
 def test_without_time_nothing_is_proven() -> None:
-    controller = oracle_controller(ENVS[0])
+    controller = oracle_controller(ENVS[0], horizon=relaxation.HORIZON)
     problem, s0 = problem_of(controller), STATES[1] / controller.lcs.state_scale.numpy()
     known = np.zeros((problem.horizon, 1))
     found = global_optimum(problem, s0, known, time_limit=0.0)
@@ -142,13 +142,13 @@ def test_without_time_nothing_is_proven() -> None:
 )
 def test_impossible_arguments_are_named(s0: np.ndarray, known: np.ndarray, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        global_optimum(problem_of(oracle_controller(ENVS[0])), s0, known)
+        global_optimum(problem_of(oracle_controller(ENVS[0], horizon=relaxation.HORIZON)), s0, known)
 
 
 @pytest.mark.parametrize("env_id", ENVS)
 def test_the_controllers_plans_are_near_the_global_optimum(env_id: str) -> None:
     """Within 1 % in the median, and within 10 % in 95 of 100."""
-    controller = oracle_controller(env_id)
+    controller = oracle_controller(env_id, horizon=relaxation.HORIZON)
     states = relaxation.start_states(env_id, 20, seed=3_000_000)
     plan = controller.plan(states)
     found = relaxation.optima(env_id, states, plan.actions, jobs=1)
