@@ -42,7 +42,7 @@ NEAR_WALL = 0.05
 """m between tip and wall, on either side of it."""
 
 HORIZON = 10
-"""Of every controller here: with a longer one, proofs of optimality take minutes a state."""
+"""Of every controller here. Each further step multiplies the modes that a proof of optimality has to rule out."""
 
 LATEST_VISIT = 50
 """Control steps of an episode within which a state is taken from it."""
