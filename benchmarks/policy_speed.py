@@ -10,6 +10,7 @@ import csv
 import time
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -30,6 +31,8 @@ from sb3_mpc_policy.solvers import Solution, Solver
 __all__ = ["Line", "latency", "run", "training"]
 
 LATENCY_ENVS = ("CartPoleSoftWallsPyBullet-v0", "CartPoleSoftWallsHardPyBullet-v0")
+LATENCY_HORIZONS = (10, None)
+"""None is the tuned one."""
 TRAINING_ENV = "CartPoleSoftWalls-v0"
 
 
@@ -46,24 +49,32 @@ class Line(NamedTuple):
 # -- one action --
 
 
-def policy_with_true_model(env_id: str, env: gym.Env) -> PPO:
-    """The tuned policy, untrained, which starts from the environment's true LCS."""
+def policy_with_true_model(env_id: str, env: gym.Env, horizon: int | None = None) -> PPO:
+    """The tuned policy, untrained, which starts from the environment's true LCS.
+
+    :param horizon: in place of the tuned one
+    """
     settings = hyperparams(env_id)
     arguments: dict[str, Any] = settings.pop("policy_kwargs")
+    if horizon is not None:
+        arguments["horizon"] = horizon
     with cart_pole(env_id) as plant:
         matrices = plant.true_lcs()
     model = LinearComplementaritySystem.from_matrices(*matrices, state_scale=arguments.pop("state_scale"))
     return PPO("MpcLcsPolicy", env, device="cpu", policy_kwargs=arguments | {"initial_lcs": model}, **settings)
 
 
-def latency(env_id: str, n_states: int = 10_000) -> list[Line]:
+def latency(env_id: str, n_states: int = 10_000, horizon: int | None = None) -> list[Line]:
     """Of ``model.predict`` for one state: over the states of rollouts under that policy.
 
     :param env_id: a registered cart-pole
     :param n_states: states
+    :param horizon: in place of the tuned one
     """
     with contextlib.closing(gym.make(env_id)) as env:
-        model = policy_with_true_model(env_id, env)
+        model = policy_with_true_model(env_id, env, horizon)
+        policy = model.policy
+        assert isinstance(policy, MpcLcsPolicy)
         observation, _ = env.reset(seed=0)
         model.predict(observation, deterministic=True)  # what is done once
         seconds = np.empty(n_states)
@@ -75,8 +86,9 @@ def latency(env_id: str, n_states: int = 10_000) -> list[Line]:
             if terminated or truncated:
                 observation, _ = env.reset()
     values = {"p50": np.percentile(seconds, 50), "p99": np.percentile(seconds, 99), "longest": seconds.max()}
-    return [Line("latency", env_id, name, float(value), "s") for name, value in values.items()] + [
-        Line("latency", env_id, "states", n_states, "")
+    at = f"H = {policy.mpc.horizon}"
+    return [Line("latency", env_id, f"{name}, {at}", float(value), "s") for name, value in values.items()] + [
+        Line("latency", env_id, f"states, {at}", n_states, "")
     ]
 
 
@@ -201,7 +213,8 @@ def run(path: Path, with_latency: bool, with_training: bool, n_states: int = 10_
         if not wanted:
             lines += [line for line in _read(path) if line.measurement == measurement]
         elif measurement == "latency":
-            lines += [line for env_id in LATENCY_ENVS for line in latency(env_id, n_states)]
+            for env_id, horizon in product(LATENCY_ENVS, LATENCY_HORIZONS):
+                lines += latency(env_id, n_states, horizon)
         else:
             lines += training(TRAINING_ENV, steps)
     _write(path, lines)

@@ -15,7 +15,7 @@ from sb3_mpc_policy.lqr import affine_lqr
 from sb3_mpc_policy.problem import ComplementarityWeights, RelaxedProblem
 from sb3_mpc_policy.solvers import Solution, Solver
 
-__all__ = ["Problems", "cart_pole_lcs", "cart_pole_problems", "published_problems"]
+__all__ = ["Problems", "cart_pole_lcs", "cart_pole_problems", "first_pass", "published_problems"]
 
 HARD = "CartPoleSoftWallsHard-v0"
 FORCE, RESET_RANGE = 10.0, np.array([0.35, 1.0, 0.30, 1.0])
@@ -114,9 +114,21 @@ def cart_pole_problems(n_contacts: int, horizon: int, batch: int, seed: int = 0)
     lcs = LinearComplementaritySystem.from_matrices(*cart_pole_lcs(n_contacts), state_scale=tuned["state_scale"])
     bound = np.ones(1)
     controller = LcsMpc(lcs, QuadraticReward(**tuned["reward"]), -bound, bound, horizon=horizon, n_iterations=1)
-    recorder = controller.solver = _Recorder()
     states = np.random.default_rng(seed).uniform(-RESET_RANGE, RESET_RANGE, (batch, len(RESET_RANGE)))
-    controller.plan(states)
+    return first_pass(controller, states)
+
+
+def first_pass(controller: LcsMpc, states: np.ndarray) -> Problems:
+    """What a controller asks of its solver first.
+
+    :param states: (N, n_x), environment units
+    """
+    solver = controller.solver
+    recorder = controller.solver = _Recorder()
+    try:
+        controller.plan(states)
+    finally:
+        controller.solver = solver
     return recorder.asked[0]
 
 

@@ -16,11 +16,11 @@ from sb3_mpc_policy.solvers.base import Solution, Solver
 from sb3_mpc_policy.solvers.condensed import CondensedProblem
 from sb3_mpc_policy.solvers.gradient import attach_gradient
 
-__all__ = ["DaqpSolver"]
+__all__ = ["ACTIVE_AT_LOWER", "ACTIVE_AT_UPPER", "OPTIMAL", "DaqpSolver", "guessed_active_set"]
 
 _UNBOUNDED = 1e30  # DAQP's infinity
-_OPTIMAL = 1  # exit flag
-_ACTIVE_AT_LOWER = 1 | 2  # constraint flags
+OPTIMAL = 1  # exit flag
+ACTIVE_AT_UPPER, ACTIVE_AT_LOWER = 1, 1 | 2  # constraint flags
 # On a few ill-conditioned problems the plain method cycles; its proximal-point form solves those, at more iterations.
 _ATTEMPTS: dict[str, dict[str, float]] = {
     "plain": {"primal_tol": 1e-9, "iter_limit": 3000},
@@ -112,7 +112,7 @@ class _Batch:
         self.lower = np.empty((len(s0), n + n_gaps))
         self.lower[:, :n] = np.maximum(condensed.low, -_UNBOUNDED)
         self.lower[:, n:] = -condensed.gap_offset(s0)
-        self.guess = _guessed_active_set(condensed, weights)
+        self.guess = guessed_active_set(condensed, weights)
         self.x, self.multipliers = np.zeros_like(self.slope), np.zeros_like(self.lower)
         self.solved, self.retried = np.zeros((2, len(s0)), dtype=bool)
 
@@ -149,16 +149,16 @@ class _Workspace:
             return False
         batch.x[i], _, flag, info = model.solve()
         batch.multipliers[i] = info["lam"]
-        return bool(flag == _OPTIMAL and np.isfinite(batch.x[i]).all() and np.isfinite(batch.multipliers[i]).all())
+        return bool(flag == OPTIMAL and np.isfinite(batch.x[i]).all() and np.isfinite(batch.multipliers[i]).all())
 
 
-def _guessed_active_set(condensed: CondensedProblem, weights: ComplementarityWeights) -> np.ndarray:
+def guessed_active_set(condensed: CondensedProblem, weights: ComplementarityWeights) -> np.ndarray:
     """(N, n_constraints) DAQP's flags: forces held at zero where the nominal is free, gaps where it is in contact.
 
     Without the guess the method would start where all forces are as large as the tiny ``delta`` lets them be.
     """
     in_contact = (weights.gap > weights.force).reshape(len(weights.gap), len(condensed.G))
     flags = np.zeros((len(in_contact), condensed.n + len(condensed.G)), dtype=np.intc)
-    flags[:, condensed.n_actions : condensed.n] = np.where(in_contact, 0, _ACTIVE_AT_LOWER)
-    flags[:, condensed.n :] = np.where(in_contact, _ACTIVE_AT_LOWER, 0)
+    flags[:, condensed.n_actions : condensed.n] = np.where(in_contact, 0, ACTIVE_AT_LOWER)
+    flags[:, condensed.n :] = np.where(in_contact, ACTIVE_AT_LOWER, 0)
     return flags

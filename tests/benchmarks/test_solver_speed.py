@@ -266,9 +266,9 @@ def test_promises_are_judged_by_the_rows() -> None:
 
 
 def test_latency_is_that_of_as_many_states_as_asked_for() -> None:
-    lines = {line.quantity: line.value for line in policy_speed.latency("CartPoleSoftWallsPyBullet-v0", 30)}
-    assert lines["states"] == 30
-    assert 0.0 < lines["p50"] <= lines["p99"] <= lines["longest"]
+    lines = {line.quantity: line.value for line in policy_speed.latency("CartPoleSoftWallsPyBullet-v0", 30, 7)}
+    assert lines["states, H = 7"] == 30
+    assert 0.0 < lines["p50, H = 7"] <= lines["p99, H = 7"] <= lines["longest, H = 7"]
 
 
 def test_the_parts_of_a_training_run_add_up() -> None:
@@ -303,5 +303,5 @@ def test_what_is_not_measured_again_stays_in_the_file(tmp_path: Path, monkeypatc
     policy_speed.run(path, with_latency=True, with_training=False, n_states=5)
     with path.open(newline="") as file:
         lines = list(csv.DictReader(file))
-    assert [line["measurement"] for line in lines] == ["latency"] * 4 + ["training"]
+    assert [line["measurement"] for line in lines] == ["latency"] * 8 + ["training"]
     assert lines[-1]["value"] == "2.0"
