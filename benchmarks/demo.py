@@ -22,8 +22,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from benchmarks import evaluation, plots, runs
 from benchmarks.evaluation import RESET_SEEDS, Evaluation, EvaluationCallback, Evaluator
-from benchmarks.references import cart_pole, lqr, oracle
-from contact_envs.dynamics import tip_position
+from benchmarks.references import contact_env, lqr, oracle
 from sb3_mpc_policy import MpcLcsPolicy
 
 
@@ -50,10 +49,10 @@ def planner(policy: MpcLcsPolicy) -> Callable[[np.ndarray], tuple[np.ndarray, np
 
 
 def liveliest_episode(env_id: str) -> int:
-    """The reset seed, of those that are scored, whose pole starts nearest to a wall or deepest in one."""
-    with cart_pole(env_id) as plant:
+    """The reset seed, of those that are scored, whose plant starts nearest to a contact or deepest in one."""
+    with contact_env(env_id) as plant:
         starts = np.array([plant.reset(seed=seed)[0] for seed in RESET_SEEDS])
-        return RESET_SEEDS[int(np.argmax(np.abs(tip_position(starts, plant.parameters))))]
+        return RESET_SEEDS[int(np.argmin(plant.parameters.contact_gaps(starts).min(axis=1)))]
 
 
 def write_scores(path: Path, scores: Mapping[str, float]) -> None:

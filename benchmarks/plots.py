@@ -14,7 +14,7 @@ from matplotlib.ticker import MaxNLocator
 from PIL import Image
 
 from benchmarks.evaluation import SOLVED, Evaluation
-from benchmarks.references import cart_pole
+from benchmarks.references import contact_env
 
 INK, QUIET, LEARNED = "#23323d", "#8a97a0", "#0f7b8a"
 REFERENCES = {"oracle": ("#c8553d", "-"), "LQR": ("#e0a458", "--"), "untrained": (QUIET, ":")}
@@ -89,7 +89,7 @@ def rollout_animation(
     :param width: of the pictures, pixels
     """
     frames = []
-    with cart_pole(env_id) as plant:
+    with contact_env(env_id) as plant:
         observation, _ = plant.reset(seed=reset_seed)
         for step in range(steps):
             action, states = plan(observation)

@@ -12,6 +12,7 @@ from scipy.linalg import solve_discrete_are
 
 from benchmarks.evaluation import Controller
 from contact_envs.cart_pole_soft_walls import CartPoleSoftWallsEnv
+from contact_envs.soft_contact_env import SoftContactEnv
 from sb3_mpc_policy import LcsMpc, LinearComplementaritySystem, QuadraticReward, hyperparams
 
 CONTROLLER_SETTINGS = ("horizon", "terminal_value", "penalty", "smoothing", "n_iterations", "solver")
@@ -19,24 +20,36 @@ CONTROLLER_SETTINGS = ("horizon", "terminal_value", "penalty", "smoothing", "n_i
 
 
 @contextlib.contextmanager
-def cart_pole(env_id: str) -> Iterator[CartPoleSoftWallsEnv]:
-    """A cart-pole environment without its wrappers, to ask for its numbers.
+def contact_env(env_id: str) -> Iterator[SoftContactEnv]:
+    """An environment of ``contact_envs`` without its wrappers, to ask for its numbers.
 
     :raises TypeError: ``env_id`` names some other environment
     """
     with contextlib.closing(gym.make(env_id)) as env:
         plant = env.unwrapped
+        if not isinstance(plant, SoftContactEnv):
+            raise TypeError(f"env_id must name an environment of contact_envs, got {env_id!r}")
+        yield plant
+
+
+@contextlib.contextmanager
+def cart_pole(env_id: str) -> Iterator[CartPoleSoftWallsEnv]:
+    """As :func:`contact_env`, for what only a cart-pole has.
+
+    :raises TypeError: ``env_id`` names some other environment
+    """
+    with contact_env(env_id) as plant:
         if not isinstance(plant, CartPoleSoftWallsEnv):
             raise TypeError(f"env_id must name a cart-pole with soft walls, got {env_id!r}")
         yield plant
 
 
 def lqr(env_id: str) -> Controller:
-    """Linear-quadratic regulator of the true model without its walls, for the environment's own reward.
+    """Linear-quadratic regulator of the true model without its contacts, for the environment's own reward.
 
-    :param env_id: see :func:`cart_pole`
+    :param env_id: see :func:`contact_env`
     """
-    with cart_pole(env_id) as plant:
+    with contact_env(env_id) as plant:
         model = plant.true_lcs()
         Q = np.diag(plant.state_weights)
         R = np.array([[plant.action_weight * plant.max_force**2]])
@@ -55,11 +68,11 @@ def oracle_controller(env_id: str, **settings: Any) -> LcsMpc:
     Horizon, penalty, scales and the like are the environment's tuned ones; untuned, states are scaled by the
     reset range.
 
-    :param env_id: see :func:`cart_pole`
+    :param env_id: see :func:`contact_env`
     :param settings: of :class:`LcsMpc`, in place of the tuned ones
     """
     tuned = hyperparams(env_id).get("policy_kwargs", {})
-    with cart_pole(env_id) as plant:
+    with contact_env(env_id) as plant:
         space = plant.action_space
         assert isinstance(space, gym.spaces.Box)
         return LcsMpc(
