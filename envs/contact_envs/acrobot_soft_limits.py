@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from typing import ClassVar
 
 import numpy as np
-from gymnasium.utils import EzPickle
 from numpy.typing import NDArray
 
 from contact_envs._validation import positive
@@ -139,20 +138,6 @@ class AcrobotSoftLimitsEnv(SoftContactEnv):
         lean_limit: float = math.pi / 3,
         render_mode: str | None = None,
     ) -> None:
-        EzPickle.__init__(
-            self,
-            simulator,
-            parameters,
-            max_torque,
-            control_step,
-            physics_step,
-            state_weights,
-            action_weight,
-            reward_constant,
-            reset_range,
-            lean_limit,
-            render_mode,
-        )
         self.lean_limit = positive("lean_limit", lean_limit)
         super().__init__(
             plant_parameters(AcrobotParameters, parameters),

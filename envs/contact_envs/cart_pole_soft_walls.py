@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from typing import ClassVar
 
 import numpy as np
-from gymnasium.utils import EzPickle
 from numpy.typing import NDArray
 
 from contact_envs._validation import positive
@@ -140,21 +139,6 @@ class CartPoleSoftWallsEnv(SoftContactEnv):
         x_limit: float = 1.0,
         render_mode: str | None = None,
     ) -> None:
-        EzPickle.__init__(
-            self,
-            simulator,
-            parameters,
-            max_force,
-            control_step,
-            physics_step,
-            state_weights,
-            action_weight,
-            reward_constant,
-            reset_range,
-            theta_limit,
-            x_limit,
-            render_mode,
-        )
         self.theta_limit = positive("theta_limit", theta_limit)
         self.x_limit = positive("x_limit", x_limit)
         super().__init__(

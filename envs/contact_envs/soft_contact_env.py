@@ -7,7 +7,7 @@ import math
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, Self, TypeVar
 
 import gymnasium as gym
 import numpy as np
@@ -30,8 +30,7 @@ AnyPlant = TypeVar("AnyPlant", bound=Plant)
 class SoftContactEnv(gym.Env[NDArray[np.float64], NDArray[np.float32]], EzPickle, ABC):
     """A plant with one actuator and soft contacts, to be brought to rest upright.
 
-    A sub-class names its arguments and says when an episode ends. It must call ``EzPickle.__init__`` with its
-    own constructor's arguments: engines hold C++ objects that do not pickle, so a copy is rebuilt from those.
+    A sub-class names its arguments and says when an episode ends.
 
     :param parameters: of the plant
     :param max_force: of the actuator at action 1, N or N m
@@ -54,6 +53,13 @@ class SoftContactEnv(gym.Env[NDArray[np.float64], NDArray[np.float32]], EzPickle
     """Of the actuator's force in ``info``."""
     CONTACT_FORCES: ClassVar[str]
     """Of the contacts' forces in ``info``."""
+
+    def __new__(cls, *args: Any, **kwargs: Any) -> Self:
+        # Engines hold C++ objects that do not pickle: a copy is rebuilt from the arguments of whatever
+        # sub-class's constructor comes next.
+        env = super().__new__(cls)
+        EzPickle.__init__(env, *args, **kwargs)
+        return env
 
     def __init__(
         self,
