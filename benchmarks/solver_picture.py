@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,13 +11,14 @@ import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullFormatter
+from PIL import Image
 
 from benchmarks.plots import INK, LEARNED, QUIET
 
 if TYPE_CHECKING:
     from benchmarks.solver_speed import Row
 
-__all__ = ["draw"]
+__all__ = ["draw", "shows"]
 
 N_LAMBDA, HORIZON, BATCH = 2, 10, 128
 """Where the other two are fixed."""
@@ -34,7 +36,13 @@ STYLES: dict[str, tuple[str, str, str]] = {
     "proxqp-warm": (QUIET, ":", "d"),
 }
 """Colour, line and marker."""
-OURS = ("daqp", "torch")
+WIDTHS = {"daqp": (3.2, 8.0), "torch": (1.8, 5.0)}
+"""Width and size of marker of our own; the first shows under the second, with which it shares its backward pass."""
+
+
+def shows(n_lambda: int, horizon: int, batch: int) -> bool:
+    """Whether these problems are in the picture: at most one of the three differs from :data:`N_LAMBDA` and so on."""
+    return (n_lambda != N_LAMBDA) + (horizon != HORIZON) + (batch != BATCH) <= 1
 
 
 def draw(path: Path, rows: Sequence[Row]) -> None:
@@ -48,29 +56,34 @@ def draw(path: Path, rows: Sequence[Row]) -> None:
         "xtick.color": INK, "ytick.color": INK,
     }  # fmt: skip
     measured = [row for row in rows if row.status == "measured"]
-    panels: tuple[tuple[str, str, Callable[[Row], bool], str, str], ...] = (
-        ("forward", f"H = {HORIZON}, n_lambda = {N_LAMBDA}", lambda r: (r.n_lambda, r.horizon) == (N_LAMBDA, HORIZON),
-         "batch", "forward_s"),
-        ("backward", f"H = {HORIZON}, n_lambda = {N_LAMBDA}", lambda r: (r.n_lambda, r.horizon) == (N_LAMBDA, HORIZON),
-         "batch", "backward_s"),
-        ("forward", f"batch {BATCH}, n_lambda = {N_LAMBDA}", lambda r: (r.n_lambda, r.batch) == (N_LAMBDA, BATCH),
-         "horizon", "forward_s"),
-        ("forward", f"batch {BATCH}, H = {HORIZON}", lambda r: (r.horizon, r.batch) == (HORIZON, BATCH),
-         "n_lambda", "forward_s"),
+    panels: tuple[tuple[str, Callable[[Row], bool], str, str], ...] = (
+        (rf"forward, $H$ = {HORIZON}, $n_\lambda$ = {N_LAMBDA}",
+         lambda row: (row.n_lambda, row.horizon) == (N_LAMBDA, HORIZON), "batch", "forward_s"),
+        (rf"backward, $H$ = {HORIZON}, $n_\lambda$ = {N_LAMBDA}",
+         lambda row: (row.n_lambda, row.horizon) == (N_LAMBDA, HORIZON), "batch", "backward_s"),
+        (rf"forward, batch {BATCH}, $n_\lambda$ = {N_LAMBDA}",
+         lambda row: (row.n_lambda, row.batch) == (N_LAMBDA, BATCH), "horizon", "forward_s"),
+        (rf"forward, batch {BATCH}, $H$ = {HORIZON}",
+         lambda row: (row.horizon, row.batch) == (HORIZON, BATCH), "n_lambda", "forward_s"),
     )  # fmt: skip
     with matplotlib.rc_context(style):
-        figure = Figure(figsize=(10, 7.6), dpi=150, layout="constrained")
-        all_axes = figure.subplots(2, 2).ravel()
-        for axes, (kind, where, chosen, against, value) in zip(all_axes, panels, strict=True):
+        figure = Figure(figsize=(10, 8), dpi=150, layout="constrained")
+        all_axes = figure.subplots(2, 2, sharey=True).ravel()
+        for axes, (title, chosen, against, value) in zip(all_axes, panels, strict=True):
             _panel(axes, [row for row in measured if chosen(row)], against, value)
-            axes.set_title(f"{kind}, {where}", fontsize=10, loc="left")
+            axes.set_title(title, fontsize=10, loc="left")
         for axes in all_axes[::2]:
             axes.set_ylabel("milliseconds for one problem")
         handles, labels = all_axes[0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=6, frameon=False)
-        figure.suptitle("Solving the controller's problem: one thread, one run", fontweight="bold")
+        figure.suptitle(
+            "Time to solve the controller's problem, and to differentiate it, on one thread", fontweight="bold"
+        )
         path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path)
+        drawn = io.BytesIO()
+        figure.savefig(drawn)
+    with Image.open(drawn) as picture:  # a palette makes a small file
+        picture.convert("RGB").quantize(128, dither=Image.Dither.NONE).save(path, optimize=True)
 
 
 def _panel(axes: Axes, rows: Sequence[Row], against: str, value: str) -> None:
@@ -80,18 +93,17 @@ def _panel(axes: Axes, rows: Sequence[Row], against: str, value: str) -> None:
         points = [point for point in points if point[1] is not None]
         if not points:
             continue
-        ours = solver in OURS
+        width, size = WIDTHS.get(solver, (1.2, 4.5))
         axes.plot(
             [at for at, _, _ in points], [1e3 * seconds / batch for _, seconds, batch in points], line, color=colour,
-            marker=marker, markersize=6 if ours else 4.5, linewidth=2.4 if ours else 1.3, label=solver,
-            zorder=3 if ours else 2,
+            marker=marker, markersize=size, linewidth=width, label=solver, zorder=3 if solver in WIDTHS else 2,
         )  # fmt: skip
     axes.set_yscale("log")
     if against == "n_lambda":
-        axes.set_xlabel("contacts n_lambda")
+        axes.set_xlabel(r"contacts $n_\lambda$")
     else:
         axes.set_xscale("log", base=2)
-        axes.set_xlabel({"batch": "batch", "horizon": "horizon H"}[against])
+        axes.set_xlabel({"batch": "batch", "horizon": "horizon $H$"}[against])
     axes.set_xticks(ticks, [f"{tick:,}" for tick in ticks])
     axes.xaxis.set_minor_formatter(NullFormatter())
     axes.yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{y:g}"))

@@ -12,6 +12,7 @@ from sb3_mpc_policy.solvers.condensed import CondensedProblem
 __all__ = ["ProxQp"]
 
 _UNBOUNDED = 1e30  # ProxQP's infinity
+_MOST_ITERATIONS = 200  # of the outer loop: what it solves at all takes it less than 20, and its own limit is 10,000
 
 
 class ProxQp(CondensedRival):
@@ -28,6 +29,7 @@ class ProxQp(CondensedRival):
         self._qp = proxqp.dense.QP(condensed.n, 0, n_gaps, True)
         settings = self._qp.settings
         settings.eps_abs, settings.eps_rel = TOLERANCE, 0.0
+        settings.max_iter = _MOST_ITERATIONS
         settings.initial_guess = proxqp.InitialGuess.NO_INITIAL_GUESS
         none = np.full(n_gaps, _UNBOUNDED)
         low, high = np.maximum(condensed.low, -_UNBOUNDED), np.minimum(condensed.high, _UNBOUNDED)
