@@ -21,6 +21,7 @@ from typing import NamedTuple
 import gymnasium as gym
 import numpy as np
 import torch
+from gymnasium.envs.registration import EnvSpec
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 
@@ -53,12 +54,12 @@ class Evaluator:
     All episodes run in lockstep, one environment an episode, so that a controller sees one batch a step;
     episodes that are over leave the batch.
 
-    :param env_id: a registered environment with a Box action space
+    :param env_id: a registered environment with a Box action space, or a specification of one with other arguments
     :param n_episodes: the first so many of :data:`RESET_SEEDS`
     :raises ValueError: ``n_episodes`` is out of range, or the action space is not a Box
     """
 
-    def __init__(self, env_id: str, n_episodes: int = len(RESET_SEEDS)) -> None:
+    def __init__(self, env_id: str | EnvSpec, n_episodes: int = len(RESET_SEEDS)) -> None:
         if not 1 <= n_episodes <= len(RESET_SEEDS):
             raise ValueError(f"n_episodes must be in 1..{len(RESET_SEEDS)}, got {n_episodes!r}")
         self.envs = [gym.make(env_id) for _ in range(n_episodes)]

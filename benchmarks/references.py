@@ -8,6 +8,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 from scipy.linalg import solve_discrete_are
 
 from benchmarks.evaluation import Controller
@@ -20,9 +21,10 @@ CONTROLLER_SETTINGS = ("horizon", "terminal_value", "penalty", "smoothing", "n_i
 
 
 @contextlib.contextmanager
-def contact_env(env_id: str) -> Iterator[SoftContactEnv]:
+def contact_env(env_id: str | EnvSpec) -> Iterator[SoftContactEnv]:
     """An environment of ``contact_envs`` without its wrappers, to ask for its numbers.
 
+    :param env_id: a registered id, or a specification with other arguments
     :raises TypeError: ``env_id`` names some other environment
     """
     with contextlib.closing(gym.make(env_id)) as env:
@@ -44,7 +46,7 @@ def cart_pole(env_id: str) -> Iterator[CartPoleSoftWallsEnv]:
         yield plant
 
 
-def lqr(env_id: str) -> Controller:
+def lqr(env_id: str | EnvSpec) -> Controller:
     """Linear-quadratic regulator of the true model without its contacts, for the environment's own reward.
 
     :param env_id: see :func:`contact_env`
@@ -62,7 +64,7 @@ def lqr(env_id: str) -> Controller:
     return act
 
 
-def oracle_controller(env_id: str, **settings: Any) -> LcsMpc:
+def oracle_controller(env_id: str | EnvSpec, **settings: Any) -> LcsMpc:
     """The learned policy's controller with the true model and the true reward: "MPC with true dynamics".
 
     Horizon, penalty, scales and the like are the environment's tuned ones; untuned, states are scaled by the
@@ -71,7 +73,7 @@ def oracle_controller(env_id: str, **settings: Any) -> LcsMpc:
     :param env_id: see :func:`contact_env`
     :param settings: of :class:`LcsMpc`, in place of the tuned ones
     """
-    tuned = hyperparams(env_id).get("policy_kwargs", {})
+    tuned = hyperparams(env_id if isinstance(env_id, str) else env_id.id).get("policy_kwargs", {})
     with contact_env(env_id) as plant:
         space = plant.action_space
         assert isinstance(space, gym.spaces.Box)
@@ -86,7 +88,7 @@ def oracle_controller(env_id: str, **settings: Any) -> LcsMpc:
         )
 
 
-def oracle(env_id: str) -> Controller:
+def oracle(env_id: str | EnvSpec) -> Controller:
     """:func:`oracle_controller`, as a controller to be scored."""
     controller = oracle_controller(env_id)
 

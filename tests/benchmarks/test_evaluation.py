@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 import sb3_mpc_policy  # noqa: F401 - registers the policy and the environments
 from benchmarks import evaluation
 from benchmarks.evaluation import Evaluation, EvaluationCallback, Evaluator
-from benchmarks.references import lqr, oracle
+from benchmarks.references import cart_pole, lqr, oracle
 
 ENV_ID = "CartPoleSoftWallsPyBullet-v0"
 ORACLE = 1000.0
@@ -108,9 +108,11 @@ def test_the_oracle_balances_every_pole_that_lqr_does(evaluator: Evaluator) -> N
     assert evaluator.returns(oracle(ENV_ID)) == pytest.approx(evaluator.returns(lqr(ENV_ID)), rel=0.05)
 
 
-def test_references_are_for_the_cart_pole() -> None:
+def test_references_are_for_environments_that_know_their_true_model() -> None:
     with pytest.raises(TypeError, match="env_id"):
         lqr("Pendulum-v1")
+    with pytest.raises(TypeError, match="env_id must name a cart-pole"), cart_pole("AcrobotSoftLimitsPyBullet-v0"):
+        pass
 
 
 def test_an_environment_without_a_box_of_actions_is_refused() -> None:
