@@ -82,6 +82,22 @@ class AcrobotSoftLimitsEnv(SoftContactEnv):
     - `"limit_torques"`: array (2,), the right and the left stop's torque on the first link in N m, >= 0,
       averaged over the step (on reset: in the starting state).
 
+    ## Why these numbers
+
+    Mean return over 50 starts on PyBullet, of LQR, which knows the true model but no stop, and of the
+    complementarity controller with the true model (`python -m benchmarks.contact_matters`).
+
+    | changed                                       | LQR   | with contact |
+    |-----------------------------------------------|-------|--------------|
+    | nothing                                       | 1,162 | 5,506        |
+    | `reset_range=(0.03, 0.03, 0.05, 0.05)`        | 3,194 | 5,661        |
+    | `reset_range=(0.1, 0.1, 0.2, 0.2)`            | 35    | 5,565        |
+    | `max_torque=5.0`                              | 1,309 | 5,298        |
+    | `max_torque=20.0`                             | 835   | 5,404        |
+    | `parameters={"limit_stiffness": 100.0}`       | 1,032 | 5,204        |
+    | `parameters={"limit_stiffness": 1000.0}`      | 1,185 | 5,606        |
+    | `parameters={"limit_angle": 0.1}`             | 431   | 5,876        |
+
     ## Arguments
 
     ```python
