@@ -2,19 +2,12 @@
 
     minimise   mean_i w_i |(s'_i − f(s_i, a_i) − features_i · beta) / deviation|²
 
-The problem has many local minima, in which some contacts lie where none is needed and others are missing. Each is
-reached quickly (:mod:`sb3_mpc_policy.descent`), so the search is global, by *basin hopping* (Wales and Doye 1997):
+The problem has many local minima. :mod:`sb3_mpc_policy.descent` reaches each quickly, and
+:mod:`sb3_mpc_policy.basin_hopping` goes from one to the next until what is left looks like noise. Here the data are
+brought into units in which that works, and the result back into the caller's.
 
-* a start is a set of gap rows, each the best of a few random hinges for what those before it leave unexplained, as in
-  matching pursuit; of a few short descents the best is finished;
-* then, as long as it helps, the contact that explains least is taken out, a hinge that explains much of what is left
-  takes its place, and the descent is repeated;
-* the search ends when what is left looks like noise: errors of neighbouring data have nothing to do with each other
-  (the *delta test*, Pi and Peterson 1994) and are distributed as noise is; or when two searches end in one minimum;
-* it runs on part of the data, in which those that a linear model does not explain are drawn more often, because
-  contacts are rare; the best model is polished on all of them;
-* a contact may be swapped for its mirror image, gap for force, without any change in what the model predicts. Of
-  these, the one that is open in most of the data is chosen, so that A, B and d are the free motion.
+A contact may be swapped for its mirror image, gap for force, without any change in what the model predicts. Of these
+the one that is open in most of the data is chosen, so that A, B and d are the free motion.
 """
 
 from __future__ import annotations
@@ -23,29 +16,16 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import cKDTree
 
-from sb3_mpc_policy.descent import MOST_CONTACTS, Contacts, Data, Fit, descend, evaluate, pivoted
+from sb3_mpc_policy.basin_hopping import EXPLAINED, Noise, Search, informative_part, polished
+from sb3_mpc_policy.descent import MOST_CONTACTS, Contacts, Data, Fit
 from sb3_mpc_policy.lcp import LcpSolver
 from sb3_mpc_policy.lcs import LcsMatrices
 from sb3_mpc_policy.prediction import step_deviation
 
 __all__ = ["Identified", "identify", "select_n_contacts"]
 
-_SHORT, _LONG, _POLISH = 15, 45, 100  # iterations of a descent
-_POLISHED = 1e-9  # relative decrease at which the last one ends
 _LITTLE_SEARCH = 10  # descents
-_POOL = 3  # short descents of which the best is finished
-_FEW_HINGES, _MANY_HINGES = 10, 200  # that compete for a place in a start, in a repair
-_LEAST_SHARE, _LARGEST_SHARE = 5e-3, 0.9  # of the data that such a hinge touches
-_LEAST_PART, _DATA_PER_PARAMETER = 600, 25  # of the data that the search works on
-_MOST_PAIRS = 5000  # of neighbours, in which noise is looked for
-_DEVIATIONS = 2.0  # within which correlation is chance
-_NORMAL = 1.1  # how much more than their median tells the residuals of a good fit may be
-_TINY = float(np.finfo(float).tiny)
-_EXPLAINED = 1e-12  # share of the variance that counts as nothing
-_SAME_MINIMUM = 1.01
-_MEDIAN_OF_SQUARE = 0.4549  # of a standard normal variable
 
 
 class Identified(NamedTuple):
@@ -129,18 +109,16 @@ def identify(
     units = _Units.of(s, a, s_next, features, feature_ridge, weights, deviation)
     guesses = [units.contacts(rows, F, int(n_contacts)) for rows, F in start]
     generator = np.random.default_rng(rng)
-    part = _informative_part(units.data, int(n_contacts), generator)
-    search = _Search(part, int(n_contacts), generator)
-    found = search.run(guesses, int(n_starts))
-    noise = _Noise(units.data, generator)
-    fit = _polished(units.data, found)
-    left = int(n_starts) - search.descents
-    if part is not units.data and left > 0 and not noise.is_all_of(fit):
-        # all data show what a part of them hid
-        again = _Search(units.data, int(n_contacts), generator, noise)
-        fit = _polished(units.data, again.run([fit.contacts], left))
-        search.descents += again.descents
-    return units.identified(fit, search.descents, noise)
+    part = informative_part(units.data, int(n_contacts), generator)
+    search = Search(part, int(n_contacts), generator)
+    fit = polished(units.data, search.run(guesses, int(n_starts)))
+    made, noise = search.descents, Noise(units.data, generator)
+    if part is not units.data and made < n_starts and not noise.is_all_of(fit):
+        # all data may show what a part of them hid
+        search = Search(units.data, int(n_contacts), generator, noise)
+        fit = polished(units.data, search.run([fit.contacts], int(n_starts) - made))
+        made += search.descents
+    return units.identified(fit, made, noise)
 
 
 def select_n_contacts(
@@ -253,7 +231,7 @@ class _Units(NamedTuple):
         P = np.hstack([rows[:, :-1] * self.size, rows[:, -1:] + rows[:, :-1] @ self.mean[:, None]])
         return Contacts.of(P, F)
 
-    def identified(self, fit: Fit, n_starts: int, noise: _Noise) -> Identified:
+    def identified(self, fit: Fit, n_starts: int, noise: Noise) -> Identified:
         """A fit in the caller's coordinates, forces and gaps scaled to a unit diagonal of F."""
         n_x, n_z, n = self.n_x, len(self.mean), len(fit.F)
         root = np.sqrt(np.diag(fit.F))
@@ -276,7 +254,7 @@ class _Units(NamedTuple):
         n_parameters = n_x * fit.W.shape[0] + n_x * n + n * (n_z + 1) + n * n - 2 * n
         weights = self.data.weights
         n_data = n_x / np.square(weights).sum()  # as many as count alike
-        variance = max(fit.cost, _EXPLAINED * n_x)
+        variance = max(fit.cost, EXPLAINED * n_x)
         return Identified(
             matrices,
             smooth[:, n_z + 1 :] / self.feature_size,
@@ -303,157 +281,3 @@ def _checked(name: str, value: np.ndarray, shape: tuple[int | None, ...]) -> np.
 def _or_one(size: np.ndarray, magnitude: np.ndarray | float) -> np.ndarray:
     """Sizes, one for columns that are constant but for rounding."""
     return np.where(size > 1e-12 * (1.0 + magnitude), size, 1.0)
-
-
-# -- the search --
-
-
-def _polished(data: Data, found: Fit) -> Fit:
-    """A fit to all data, of the equivalent models the one whose contacts are mostly open."""
-    fit = evaluate(data, found.contacts)
-    opened = evaluate(data, pivoted(fit.contacts, fit.active.mean(axis=0) > 0.5))
-    if opened.objective < _SAME_MINIMUM * fit.objective:  # else its F is not among those allowed
-        fit = opened
-    return descend(data, fit, _POLISH, _POLISHED)
-
-
-class _Search:
-    """Basin hopping for n contacts on given data."""
-
-    def __init__(self, data: Data, n: int, rng: np.random.Generator, noise: _Noise | None = None) -> None:
-        self.data, self.n, self.rng = data, n, rng
-        self.noise = noise or _Noise(data, rng)
-        self.descents = 0
-
-    def run(self, guesses: Sequence[Contacts], most: int) -> Fit:
-        """The best of rounds of basin hopping with ``most`` descents altogether."""
-        best: Fit | None = None
-        while True:
-            found = self._round(guesses, most)
-            twice = best is not None and found.cost < _SAME_MINIMUM * best.cost < _SAME_MINIMUM**2 * found.cost
-            if best is None or found.objective < best.objective:
-                best = found
-            if twice or self.descents >= most or self._at_floor(best):
-                return best
-            guesses = ()
-
-    def _round(self, guesses: Sequence[Contacts], most: int) -> Fit:
-        pool = [self._descend(self._filled(guess), _SHORT) for guess in guesses[:most]]
-        while len(pool) < _POOL and not any(map(self._at_floor, pool)) and (self.descents < most or not pool):
-            pool.append(self._descend(self._filled(None), _SHORT))
-        fit = descend(self.data, min(pool, key=lambda fit: fit.objective), _LONG)
-        failures = 0
-        while self.descents < most and failures < max(4, self.n) and not self._at_floor(fit):
-            hopped = self._descend(self._repaired(fit), _SHORT + _LONG)
-            failures = 0 if hopped.objective < 0.99 * fit.objective else failures + 1
-            fit = min(fit, hopped, key=lambda fit: fit.objective)
-        return fit
-
-    def _descend(self, contacts: Contacts, iterations: int) -> Fit:
-        self.descents += 1
-        return descend(self.data, evaluate(self.data, contacts), iterations)
-
-    def _at_floor(self, fit: Fit) -> bool:
-        return self.n == 0 or self.noise.is_all_of(fit)
-
-    def _filled(self, guess: Contacts | None) -> Contacts:
-        """A guess, with contacts added one by one until there are n."""
-        p = self.data.z.shape[1]
-        contacts = guess or Contacts(np.zeros((0, p)), np.zeros((0, 0)), np.zeros((0, 0)))
-        while len(contacts.P) < self.n:
-            hinge = self._hinge(evaluate(self.data, contacts), _FEW_HINGES)
-            contacts = _with_row(contacts, hinge)
-        return contacts
-
-    def _repaired(self, fit: Fit) -> Contacts:
-        """Take a contact out, one that explains little, and let a hinge that explains much take its place."""
-        losses = [evaluate(self.data, fit.contacts.without(row)).objective for row in range(self.n)]
-        rank = min(int(self.rng.exponential(1.5)), self.n - 1)
-        rest = fit.contacts.without(int(np.argsort(losses)[rank]))
-        return _with_row(rest, self._hinge(evaluate(self.data, rest), _MANY_HINGES))
-
-    def _hinge(self, fit: Fit, candidates: int) -> np.ndarray:
-        """(p,) the gap row, of random ones, whose force explains most of what a fit leaves."""
-        z, weights = self.data.z, self.data.weights
-        rows = self.rng.normal(size=(candidates, z.shape[1]))
-        rows[:, :-1] /= np.maximum(np.linalg.norm(rows[:, :-1], axis=1, keepdims=True), 1e-12)
-        along = z[:, :-1] @ rows[:, :-1].T
-        share = np.exp(self.rng.uniform(np.log(_LEAST_SHARE), np.log(_LARGEST_SHARE), candidates))
-        last = np.minimum((share * len(z)).astype(int), len(z) - 1)
-        rows[:, -1] = -np.sort(along, axis=0)[last, np.arange(candidates)]
-        forces = np.maximum(-(along + rows[:, -1]), 0.0)
-        known = np.hstack([self.data.smooth, fit.forces])
-        weighted = known * weights[:, None]
-        gram = weighted.T @ known
-        gram += 1e-9 * np.diag(np.diag(gram) + 1.0)
-        forces = forces - known @ np.linalg.solve(gram, weighted.T @ forces)
-        weighted = forces * weights[:, None]
-        gain = np.square(weighted.T @ fit.residual).sum(axis=1) / ((weighted * forces).sum(axis=0) + 1e-12)
-        return rows[np.argmax(gain)]
-
-
-def _with_row(contacts: Contacts, row: np.ndarray) -> Contacts:
-    """One contact more, of the others' size, that does not act on them."""
-    P, G, S = contacts
-    n = len(P)
-    size = np.median(np.linalg.norm(P[:, :-1], axis=1)) if n else 1.0
-    G, S = np.pad(G, (0, 1)), np.pad(S, (0, 1))
-    G[n, n] = 1.0
-    return Contacts(np.vstack([P, size * row]), G, S)
-
-
-def _informative_part(data: Data, n_contacts: int, rng: np.random.Generator) -> Data:
-    """As much of the data as the search needs. What no contact explains is drawn more often, and counts less."""
-    n, p, k, n_x = len(data), data.z.shape[1], data.smooth.shape[1], data.y.shape[1]
-    n_parameters = n_x * (k + n_contacts) + n_contacts * (p + 2 * n_contacts)
-    enough = max(_LEAST_PART, -(-_DATA_PER_PARAMETER * n_parameters // n_x))
-    if enough >= n:
-        return data
-    free = evaluate(data, Contacts(np.zeros((0, p)), np.zeros((0, 0)), np.zeros((0, 0))))
-    surprise = np.sqrt(np.square(free.residual).sum(axis=1) * data.weights)
-    chance = 1.0 / n + surprise / max(surprise.sum(), _TINY)
-    chance /= chance.sum()
-    index = rng.choice(n, enough, replace=False, p=chance)
-    return data.part(index, data.weights[index] / chance[index])
-
-
-# -- the noise --
-
-
-class _Noise:
-    """Tells noise from what a model could still explain.
-
-    Noise at one point says nothing about noise at the next, whereas a missing contact shifts all data around it. That
-    is blind to contacts which hardly any data touch; those leave residuals that are too large for their median.
-    """
-
-    def __init__(self, data: Data, rng: np.random.Generator) -> None:
-        index = rng.permutation(np.flatnonzero(data.weights > 0.0))[:_MOST_PAIRS]
-        index = index[np.unique(data.z[index], axis=0, return_index=True)[1]]
-        self.first = self.second = index
-        if len(index) > 1:
-            self.second = index[cKDTree(data.z[index]).query(data.z[index], k=2)[1][:, 1]]
-        self.weights = data.weights[index] / data.weights[index].sum()
-        self.n_pairs = 1.0 / np.square(self.weights).sum()  # as many as count alike
-
-    def _correlation(self, fit: Fit) -> float:
-        """Between the residuals of neighbours, 0 to 1."""
-        first, second = fit.residual[self.first], fit.residual[self.second]
-        together = self.weights @ (first * second).sum(axis=1)
-        return float(np.clip(together / max(self.weights @ np.square(first).sum(axis=1), _TINY), 0.0, 1.0))
-
-    def _from_median(self, fit: Fit) -> float:
-        """The cost, were the residuals normally distributed."""
-        return float(np.median(np.square(fit.residual[self.first]), axis=0).sum() / _MEDIAN_OF_SQUARE)
-
-    def floor(self, fit: Fit) -> float:
-        """The cost that noise alone would leave."""
-        return min(fit.cost * (1.0 - self._correlation(fit)), self._from_median(fit))
-
-    def is_all_of(self, fit: Fit) -> bool:
-        """Whether the residuals look like nothing but noise."""
-        n_x = fit.residual.shape[1]
-        if fit.cost <= _EXPLAINED * n_x:
-            return True
-        uncertain = _DEVIATIONS / np.sqrt(self.n_pairs * n_x)
-        return self._correlation(fit) < uncertain and fit.cost < (_NORMAL + uncertain) * self._from_median(fit)

@@ -165,6 +165,15 @@ def test_data_of_no_weight_do_not_matter():
     assert test_error(found, system) < 1e-5
 
 
+def test_few_data_of_weight_among_many_are_enough():
+    system = random_system(8, 0)
+    s, a, s_next = sample(system, 8, 3000)
+    weights = np.zeros(3000)
+    weights[-20:], s_next[:-20] = 1.0, 0.0
+    found = identify(s, a, s_next, 2, weights=weights, deviation=np.ones(3), rng=0)
+    np.testing.assert_allclose(found.predict(s[-20:], a[-20:]), s_next[-20:], atol=1e-5)
+
+
 def test_a_weight_of_two_is_the_data_twice():
     s, a, s_next = sample(random_system(9, 0), 9, 60, noise=1.0)
     weights = np.where(np.arange(60) < 20, 2.0, 1.0)
