@@ -100,9 +100,10 @@ def complementarity_weights(
     :param penalty: rho > 0
     :param smoothing: epsilon >= 0
     """
-    u = forces * stiffness - gaps
-    root = np.sqrt(u**2 + 4.0 * smoothing)
-    share = 0.5 + 0.5 * np.divide(u, root, out=np.zeros_like(u), where=root > 0)
+    with np.errstate(over="ignore", invalid="ignore"):  # of a model that explodes; no solver takes what comes of it
+        u = forces * stiffness - gaps
+        root = np.hypot(u, 2.0 * np.sqrt(smoothing))
+        share = 0.5 + 0.5 * np.divide(u, root, out=np.zeros_like(u), where=root > 0)
     return ComplementarityWeights(penalty * share, penalty * (1.0 - share) * stiffness)
 
 
