@@ -13,7 +13,7 @@ PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS)
 SOURCES := sb3_mpc_policy envs benchmarks tests
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-slow check format benchmark docs clean
+.PHONY: help setup demo test test-slow check format benchmark benchmark-solvers docs clean
 
 help: ## list the targets
 	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1\t\2/' | expand -t 20
@@ -53,6 +53,13 @@ format: setup ## rewrite the sources as `check` wants them
 benchmark: setup ## the learning benchmark and the engines' errors, into benchmarks/results/
 	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.learn --jobs $(WORKERS)
 	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.physics
+
+benchmark-solvers: setup ## the solvers' speed and accuracy and the relaxation's quality, into benchmarks/results/
+	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.solver_speed
+	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.solver_speed --latency --training
+	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.solver_accuracy
+	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.relaxation
+	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.warm_start
 
 docs: setup ## build the documentation into docs/_build/html
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]'
