@@ -218,9 +218,9 @@ def run(path: Path, with_latency: bool, with_training: bool, n_states: int = 10_
         else:
             lines += training(TRAINING_ENV, steps)
     _write(path, lines)
-    table = Table(title="Speed of the policy", box=SIMPLE_HEAD)
+    table = Table(title="Speed of the policy", box=SIMPLE_HEAD, padding=0)
     for name in Line._fields[:3]:
-        table.add_column(name, overflow="fold")
+        table.add_column(name, overflow="fold", no_wrap=name == "environment")
     table.add_column("value", justify="right", no_wrap=True)
     for line in lines:
         scale, unit = (1e3, "ms") if line.unit == "s" and line.value < 0.1 else (1.0, line.unit)
