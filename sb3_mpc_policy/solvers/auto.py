@@ -1,4 +1,4 @@
-"""The solver for a batch, by where the model lives, how many problems there are, and how long the horizon is."""
+"""The solver for a batch, by where the model lives, how many problems there are, and how large they are."""
 
 from __future__ import annotations
 
@@ -17,26 +17,32 @@ __all__ = ["CHOICES", "AutomaticSolver", "Choice", "choose"]
 
 
 class Choice(NamedTuple):
-    """A solver, and the batches it is for."""
+    """A solver, and the batches it is for: on this device (None: any), so many problems or more, each with so many
+    contacts over its horizon (H n_lambda) or more."""
 
-    device: str
+    device: str | None
     least_batch: int
-    longest_horizon: float
+    least_contacts: int
     solver: str
 
 
 CHOICES = (
-    Choice("cpu", 1, float("inf"), "daqp"),
-    Choice("cuda", 2048, float("inf"), "torch"),
-    Choice("cuda", 1, float("inf"), "daqp"),
+    # The active-set method's time grows with the cube of the contacts over the horizon, the interior point's linearly.
+    # Forward, ms a problem at batch 64 to 128, daqp against torch: 0.09 and 0.8 at 40 contacts, 0.3 and 1.5 at 80, 1.3
+    # to 1.5 and 1.8 to 3.2 at 160, 12 to 13 and 5 to 6 at 320 (benchmarks/results/solver_speed.csv)
+    Choice(None, 64, 320, "torch"),
+    Choice(None, 1, 640, "torch"),
+    # Not measured, for want of a GPU: below this batch the launches alone are estimated to take longer than daqp.
+    Choice("cuda", 2048, 0, "torch"),
+    Choice(None, 1, 0, "daqp"),
 )
 """The first that fits is taken."""
 
 
-def choose(device: str, batch: int, horizon: int) -> str:
-    """The name of the solver for so many problems of this horizon; "daqp" for a device that is not in the table."""
+def choose(device: str, batch: int, contacts: int) -> str:
+    """The name of the solver for so many problems, each with so many contacts over its horizon (H n_lambda)."""
     for choice in CHOICES:
-        if choice.device == device and batch >= choice.least_batch and horizon <= choice.longest_horizon:
+        if choice.device in (None, device) and batch >= choice.least_batch and contacts >= choice.least_contacts:
             return choice.solver
     return "daqp"
 
@@ -50,7 +56,8 @@ class AutomaticSolver(Solver):
         """Problems so far that the active-set method did not solve."""
 
     def _for(self, problem: RelaxedProblem, batch: int) -> Solver:
-        name = choose(torch.device(problem.device).type, batch, problem.horizon)
+        *_, n_contacts = problem.sizes
+        name = choose(torch.device(problem.device).type, batch, problem.horizon * n_contacts)
         return self.interior_point if name == "torch" else self.active_set_method
 
     def solve(self, problem: RelaxedProblem, s0: np.ndarray, weights: ComplementarityWeights) -> Solution:

@@ -26,10 +26,11 @@ _ATTEMPTS: dict[str, dict[str, float]] = {
     "plain": {"primal_tol": 1e-9, "iter_limit": 3000},
     "proximal": {"primal_tol": 1e-9, "iter_limit": 3000, "eps_prox": 1e-6},
 }
-# Where Q's condition is beyond this, and in the proximal form, digits are lost that show in the actions. The active set
-# is right or nearly so: the solution is then found again on it, and must meet the optimality conditions.
-_ILL_CONDITIONED = 1e10
-_SOLVED = 1e-12  # of the KKT residual: a right active set leaves 1e-15, and 1e-10 has been seen beside wrong actions
+# Where Q's condition is beyond this, and in the proximal form, digits may be lost that show in the actions. The active
+# set is right or nearly so: the solution is then found again on it, and must meet the optimality conditions.
+_ILL_CONDITIONED = 1e11
+# Of the KKT residual: a right active set leaves 1e-15, and 1e-10 has been seen beside wrong actions.
+_EXACT, _SOLVED = 1e-14, 1e-12
 # A solve lets go of Python's lock, the call around it does not: on fewer variables threads would wait for each other.
 _THREADED_SIZE = 60
 _LEAST_PER_THREAD = 16
@@ -76,14 +77,19 @@ class DaqpSolver(Solver):
 
     @staticmethod
     def _refine(condensed: CondensedProblem, batch: _Batch, index: np.ndarray) -> None:
-        """Find the solutions at ``index`` again, on their active sets, and keep the better ones."""
+        """Find the solutions at ``index`` that are not exact again, on their active sets, and keep the better ones."""
         if not len(index):
             return
-        f, g, multipliers = batch.slope[index], -batch.lower[index, condensed.n :], batch.multipliers[index]
+        gaps = -batch.lower[:, condensed.n :]
+        before = condensed.residual(batch.x[index], batch.multipliers[index], batch.slope[index], gaps[index])
+        index, before = index[~(before < _EXACT)], before[~(before < _EXACT)]
+        if not len(index):
+            return
+        f, g, multipliers = batch.slope[index], gaps[index], batch.multipliers[index]
         free, on_gap = active_constraints(torch.as_tensor(multipliers), condensed.n)
         at_low = ~free & torch.as_tensor(multipliers[:, : condensed.n] < 0)
         x, exact = exact_solution(condensed, "cpu", f, g, at_low, ~free & ~at_low, on_gap)
-        before, after = condensed.residual(batch.x[index], multipliers, f, g), condensed.residual(x, exact, f, g)
+        after = condensed.residual(x, exact, f, g)
         better = after < before  # False for NaN
         batch.x[index[better]], batch.multipliers[index[better]] = x[better], exact[better]
         batch.solved[index] = np.where(better, after, before) < _SOLVED

@@ -512,10 +512,15 @@ def test_an_unknown_solver_is_named_with_those_there_are():
 
 
 def test_the_table_of_choices_has_a_solver_for_every_batch():
-    for device, batch, horizon in product(["cpu", "cuda", "mps"], [1, 2047, 10**6], [1, 10**4]):
-        assert choose(device, batch, horizon) in SOLVERS
-    assert choose("cuda", 10**6, 10) == "torch"
-    assert choose("cpu", 10**6, 10) == "daqp"
+    for device, batch, contacts in product(["cpu", "cuda", "mps"], [1, 63, 64, 2047, 10**6], [0, 20, 320, 640, 10**4]):
+        assert choose(device, batch, contacts) in SOLVERS
+    assert choose("cuda", 10**6, 20) == "torch"
+    assert choose("cpu", 10**6, 20) == "daqp"
+
+
+def test_long_horizons_with_many_contacts_go_to_the_stage_wise_method():
+    assert choose("cpu", 128, 319) == choose("cpu", 63, 320) == "daqp"
+    assert choose("cpu", 64, 320) == choose("cpu", 1, 640) == "torch"
 
 
 def test_the_automatic_choice_solves_and_differentiates_like_the_solver_it_stands_for(monkeypatch):
