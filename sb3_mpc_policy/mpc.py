@@ -102,8 +102,7 @@ def complementarity_weights(
     """
     with np.errstate(over="ignore", invalid="ignore"):  # of a model that explodes; no solver takes what comes of it
         u = forces * stiffness - gaps
-        root = np.hypot(u, 2.0 * np.sqrt(smoothing))
-        share = 0.5 + 0.5 * np.divide(u, root, out=np.zeros_like(u), where=root > 0)
+        share = 0.5 + 0.5 * (u / np.hypot(u, 2.0 * np.sqrt(smoothing)) if smoothing else np.sign(u))
     return ComplementarityWeights(penalty * share, penalty * (1.0 - share) * stiffness)
 
 
@@ -341,7 +340,7 @@ class LcsMpc(nn.Module):
 
         Both modes allow a plan that touches, so the next pass can only gain by the change.
         """
-        stiffness = np.diag(problem.model.F)
+        stiffness = problem.stiffness
         weights = complementarity_weights(nominal.forces, nominal.gaps, stiffness, penalty, self.smoothing)
         if before is not None:
             touching = (nominal.forces * stiffness < _TOUCHING) & (nominal.gaps < _TOUCHING)
@@ -443,7 +442,7 @@ def _mean_weight(W: np.ndarray) -> float:
 
 def _in_contact(problem: RelaxedProblem, weights: ComplementarityWeights) -> np.ndarray:
     """(N, H, n_lambda) the mode that the weights ask for: whether they push the gap down rather than the force."""
-    return weights.gap * np.diag(problem.model.F) > weights.force
+    return weights.gap * problem.stiffness > weights.force
 
 
 def _finished(
@@ -454,7 +453,7 @@ def _finished(
     It is the same where both ask for one mode, and nothing is left of what they push down.
     """
     mode = _in_contact(problem, weights)
-    left = np.where(mode, solution.gaps, solution.forces * np.diag(problem.model.F))
+    left = np.where(mode, solution.gaps, solution.forces * problem.stiffness)
     done = (mode == _in_contact(problem, following)) & (left < _TOUCHING)
     result: np.ndarray = done.all(axis=(1, 2)) | ~solution.solved
     return result

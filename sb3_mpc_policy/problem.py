@@ -14,6 +14,7 @@ feel them. Everything here is in scaled coordinates and float64.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import cvxpy as cp
@@ -62,6 +63,11 @@ class RelaxedProblem:
     def sizes(self) -> tuple[int, int, int]:
         """n_x, n_a, n_lambda"""
         return (*self.model.B.shape, len(self.model.c))
+
+    @cached_property
+    def stiffness(self) -> np.ndarray:
+        """(n_lambda,) diagonal of F, which turns forces into gaps."""
+        return np.diag(self.model.F)
 
     def cost(self, states: np.ndarray, actions: np.ndarray) -> np.ndarray:
         """The cost of eq (6) without penalty. states: (N, H+1, n_x), actions: (N, H, n_a) -> (N,)"""

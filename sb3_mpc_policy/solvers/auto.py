@@ -57,7 +57,7 @@ class AutomaticSolver(Solver):
 
     def _for(self, problem: RelaxedProblem, batch: int) -> Solver:
         *_, n_contacts = problem.sizes
-        name = choose(torch.device(problem.device).type, batch, problem.horizon * n_contacts)
+        name = choose(problem.device.partition(":")[0], batch, problem.horizon * n_contacts)
         return self.interior_point if name == "torch" else self.active_set_method
 
     def solve(self, problem: RelaxedProblem, s0: np.ndarray, weights: ComplementarityWeights) -> Solution:

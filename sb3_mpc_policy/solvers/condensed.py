@@ -115,6 +115,11 @@ class CondensedProblem:
         return result.reshape((H + 1) * n_x, (H + 1) * n_x)
 
     @cached_property
+    def is_finite(self) -> bool:
+        """Whether the matrices that the problems share are."""
+        return bool(np.isfinite(self.Q).all() and np.isfinite(self.G).all())
+
+    @cached_property
     def condition(self) -> float:
         """LAPACK's estimate of Q's condition number in the 1-norm; infinite where Q is not positive definite."""
         if not np.isfinite(self.Q).all():

@@ -57,7 +57,7 @@ class DaqpSolver(Solver):
     def solve(self, problem: RelaxedProblem, s0: np.ndarray, weights: ComplementarityWeights) -> Solution:
         condensed = self._prepare(problem)
         batch = _Batch(condensed, s0, weights)
-        if np.isfinite(condensed.Q).all() and np.isfinite(condensed.G).all():
+        if condensed.is_finite:
             usable = np.flatnonzero(np.isfinite(batch.slope).all(axis=1) & np.isfinite(batch.lower).all(axis=1))
             threads = 1
             if condensed.n >= _THREADED_SIZE:
