@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import json
 from pathlib import Path
 
@@ -108,7 +109,7 @@ def test_a_rival_solves_for_the_model_it_is_given_last(name):
     solver = RIVALS[name].make()
     first, second = cart_pole_problems(2, 8, 4), cart_pole_problems(2, 8, 4)
     changed = second.problem.model._replace(A=second.problem.model.A * 1.05)
-    second = second._replace(problem=type(second.problem)(**(vars(second.problem) | {"model": changed})))
+    second = second._replace(problem=dataclasses.replace(second.problem, model=changed))
     solver.solve(*first)
     found = solver.solve(*second).actions
     np.testing.assert_allclose(
