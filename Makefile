@@ -50,9 +50,10 @@ format: setup ## rewrite the sources as `check` wants them
 	$(BIN)/ruff format $(SOURCES)
 	$(BIN)/ruff check --fix $(SOURCES)
 
-benchmark: setup ## the learning benchmark and the engines' errors, into benchmarks/results/
+benchmark: setup ## the learning benchmark, the engines' errors, what contact is worth, into benchmarks/results/
 	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.learn --jobs $(WORKERS)
 	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.physics
+	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.contact_matters
 
 benchmark-solvers: setup ## the solvers' speed and accuracy and the relaxation's quality, into benchmarks/results/
 	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.solver_speed

@@ -3,9 +3,9 @@
     Q x + Gᵀ nu = r  in the free variables,      x = 0 in the fixed ones,
     G x         = t  at the active gaps,         nu = 0 at the others
 
-A fixed variable leaves the system with its row and column, and so does an inactive gap: what remains is about a
-quarter of ``n + n_gaps`` (forces out of contact are fixed at zero), and differs from problem to problem. Problems of
-like size are padded to the largest among them and solved in one batched call, on the device of the tensors.
+A fixed variable leaves the system with its row and column, and so does an inactive gap. What remains is small, since
+forces out of contact are fixed at zero, and differs from problem to problem. Problems of like size are padded to the
+largest among them and solved in one batched call, on the device of the tensors.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 Mehrotra's predictor-corrector (Nocedal and Wright 2006, algorithm 16.4) on the problem with its states kept: Newton's
 step is then a linear-quadratic regulator for each problem, found by a Riccati recursion (Rao, Wright and Rawlings
-1998). The loops run over iterations and stages, never over problems, and the work grows with H, not with H³.
+1998). The loops run over iterations and stages, never over problems, and an iteration's work grows with H, not with H³.
 
 The method stops early: the active-set system (active_set.py) then gives the exact solution, after a few corrections of
 the set where need be. The few problems where that fails go to the active-set method on the host.
