@@ -57,6 +57,7 @@ class PredictionLossCallback(BaseCallback):
 
     def _on_training_end(self) -> None:
         self._end_update()
+        self.policy.end_training()
 
     def _end_update(self) -> None:
         reward_scale = 1.0

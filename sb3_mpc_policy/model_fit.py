@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from itertools import combinations_with_replacement
 from math import comb
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -27,7 +28,7 @@ from sb3_mpc_policy.transitions import Transitions
 __all__ = ["MODEL_FITS", "fit_tangent"]
 
 # "gradient" is the paper's Algorithm 1: nothing but eq (16) changes the model.
-MODEL_FITS = ("least_squares", "gradient")
+MODEL_FITS = ("contacts", "least_squares", "gradient")
 
 _WIDTH = 2.0  # of the region, in state scales
 _DEGREES = (2, 3)  # of the terms that take up curvature ...
@@ -54,31 +55,72 @@ def fit_tangent(
     :param prior: model to keep to where the data say nothing; ``s' = s`` where None
     :return: scale of the whitened residuals of the transitions that are not outliers
     """
+    smooth = smooth_fit(lcs, data, target, prior)
     n_x, n_a = lcs.n_states, lcs.n_actions
+    slope, offset = smooth.theta[:n_x].T, smooth.theta[n_x + n_a]
+    expected_A, expected_B, expected_d = _expected(lcs, prior)
+    for parameter, value in (
+        (lcs.A_scaled, expected_A + slope),
+        (lcs.B_scaled, expected_B + smooth.theta[n_x : n_x + n_a].T),
+        (lcs.d_scaled, expected_d + offset - slope @ smooth.centre),
+    ):
+        parameter.copy_(torch.as_tensor(value))
+    return smooth.noise
+
+
+class SmoothFit(NamedTuple):
+    """What the smooth part of a model makes of transitions, scaled coordinates."""
+
+    theta: np.ndarray
+    """(n_features, n_x) coefficients of (s, a, 1, curvature), the state counted from ``centre``"""
+    centre: np.ndarray
+    """(n_x,) where the tangent is taken"""
+    surprise: np.ndarray
+    """(N, n_x) next state minus the smooth part's: contact, and what no model explains"""
+    curvature: np.ndarray
+    """(N, n_x) what the quadratic and cubic terms add to the next state"""
+    noise: float
+    """size of what is left of transitions that are not outliers, in units of ``deviation``"""
+
+
+@torch.no_grad()
+def smooth_fit(
+    lcs: LinearComplementaritySystem,
+    data: Transitions,
+    target: np.ndarray,
+    prior: LinearComplementaritySystem | None = None,
+    with_contacts: bool = True,
+) -> SmoothFit:
+    """The regression behind :func:`fit_tangent`, which has the arguments.
+
+    :param with_contacts: False to leave contact to what the regression does not explain
+    """
     scale, action_scale = lcs.state_scale.cpu().numpy(), lcs.action_scale.cpu().numpy()
     # a target that a learned reward puts far outside the data would leave no data to fit
     centre = np.clip(target, *np.quantile(data.s, [0.05, 0.95], axis=0)) / scale
     x, u = data.s / scale, data.a / action_scale
-    expected_A, expected_B, expected_d = np.eye(n_x), np.zeros((n_x, n_a)), np.zeros(n_x)
-    if prior is not None:
-        known = prior.scaled()
-        expected_A, expected_B, expected_d = (part.detach().cpu().numpy() for part in (known.A, known.B, known.d))
-    push = (lcs.contact_force(data.s, data.a) / lcs.force_scale @ lcs.scaled().C.mT).detach().cpu().numpy()
-    surprise = data.s_next / scale - push - (x @ expected_A.T + u @ expected_B.T + expected_d)
-    theta, residual = _robust_regression(x - centre, u, surprise)
-
-    slope, offset = theta[:n_x].T, theta[n_x + n_a]
-    for parameter, value in (
-        (lcs.A_scaled, expected_A + slope),
-        (lcs.B_scaled, expected_B + theta[n_x : n_x + n_a].T),
-        (lcs.d_scaled, expected_d + offset - slope @ centre),
-    ):
-        parameter.copy_(torch.as_tensor(value))
-    return residual
+    expected_A, expected_B, expected_d = _expected(lcs, prior)
+    push = np.zeros_like(x)
+    if with_contacts:
+        push = (lcs.contact_force(data.s, data.a) / lcs.force_scale @ lcs.scaled().C.mT).cpu().numpy()
+    unexpected = data.s_next / scale - push - (x @ expected_A.T + u @ expected_B.T + expected_d)
+    theta, residual, curvature, noise = _robust_regression(x - centre, u, unexpected)
+    return SmoothFit(theta, centre, residual + push, curvature, noise)
 
 
-def _robust_regression(x: np.ndarray, u: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, float]:
-    """Coefficients (n_features, n_x) of y in (x, u, 1, curvature), and the residuals' scale."""
+def _expected(
+    lcs: LinearComplementaritySystem, prior: LinearComplementaritySystem | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A, B and d of the prior, scaled coordinates."""
+    if prior is None:
+        return np.eye(lcs.n_states), np.zeros((lcs.n_states, lcs.n_actions)), np.zeros(lcs.n_states)
+    known = prior.scaled()
+    A, B, d = (part.detach().cpu().numpy() for part in (known.A, known.B, known.d))
+    return A, B, d
+
+
+def _robust_regression(x: np.ndarray, u: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    """Coefficients (n_features, n_x) of y in (x, u, 1, curvature), residuals, what curvature adds, residuals' scale."""
     z = np.hstack([x, u])
     n, n_z = z.shape
     features = np.hstack([z, np.ones((n, 1)), *_curvature(z)])
@@ -86,7 +128,7 @@ def _robust_regression(x: np.ndarray, u: np.ndarray, y: np.ndarray) -> tuple[np.
     ridge[: n_z + 1] = _LINEAR_RIDGE
     near = np.exp(-0.5 * np.square(x / _WIDTH).sum(axis=1))
     near /= near.max()
-    deviation = _median_deviation(y)
+    deviation = median_deviation(y)
     whitened = y / deviation
 
     trust = np.ones(n)
@@ -99,7 +141,8 @@ def _robust_regression(x: np.ndarray, u: np.ndarray, y: np.ndarray) -> tuple[np.
         error = np.linalg.norm(whitened - features @ theta, axis=1) / np.sqrt(np.maximum(1.0 - leverage, 1e-3))
         size = max(1.5 * float(np.quantile(error, _INLIERS)), _LEAST_RESIDUAL)
         trust = 1.0 / (1.0 + np.square(error / size))
-    return theta * deviation, size
+    theta = theta * deviation
+    return theta, y - features @ theta, features[:, n_z + 1 :] @ theta[n_z + 1 :], size
 
 
 def _curvature(z: np.ndarray) -> list[np.ndarray]:
@@ -112,7 +155,7 @@ def _curvature(z: np.ndarray) -> list[np.ndarray]:
     return terms
 
 
-def _median_deviation(y: np.ndarray) -> np.ndarray:
+def median_deviation(y: np.ndarray) -> np.ndarray:
     """(n_x,) robust standard deviation; falls back to the ordinary one, then to one, for constant components."""
     robust = 1.4826 * np.median(np.abs(y - np.median(y, axis=0)), axis=0)
     ordinary = y.std(axis=0)

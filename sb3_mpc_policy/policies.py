@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, Self
 
 import numpy as np
 import torch
 from gymnasium import spaces
 from numpy.typing import ArrayLike
+from stable_baselines3.common.distributions import DiagGaussianDistribution, Distribution
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.common.utils import get_device
 from torch import nn
 
+from sb3_mpc_policy.contact_fit import fit_contacts
+from sb3_mpc_policy.exploration import MOST_NOISE, WanderingTarget
 from sb3_mpc_policy.lcs import LinearComplementaritySystem
 from sb3_mpc_policy.model_fit import MODEL_FITS, fit_tangent
 from sb3_mpc_policy.mpc import ControllerStatistics, LcsMpc, MpcPlan
@@ -36,7 +40,7 @@ _INITIAL_NOISE = 0.2
 
 # How the model learns, by name; each entry can be overridden by the argument of the same name.
 PRESETS: dict[str, dict[str, Any]] = {
-    "default": {"model_fit": "least_squares", "replay": True, "prediction_loss": "prediction"},
+    "default": {"model_fit": "contacts", "replay": True, "prediction_loss": "prediction"},
     # Algorithm 1 as printed: nothing but eq (16), on the current rollout D_k
     "paper": {"model_fit": "gradient", "replay": False, "prediction_loss": "prediction"},
 }
@@ -69,13 +73,16 @@ class MpcLcsPolicy(ActorCriticPolicy):
     :param preset: "default", or "paper" for Algorithm 1 as printed; sets ``prediction_loss``, ``model_fit`` and
         ``replay`` where they are None
     :param prediction_loss: "prediction" (eq 12) or "violation" (Jin et al. 2022)
-    :param model_fit: "least_squares" between rollouts, or "gradient" for eq (16) alone
+    :param model_fit: what is fitted directly between rollouts: "contacts" for the whole model, "least_squares" for A, B
+        and d only, or "gradient" for nothing, eq (16) alone
     :param policy_gradient: whether the gradient of PPO's own loss reaches the model, as in eq (16)
     :param replay: True to learn from all transitions so far, False from the current rollout alone (the paper's D_k)
     :param state_scale: (n_x,) size of each state where the controller works; the spread of the first rollout where
         None, so pass it where rollouts are as short as A2C's
     :param action_scale: (n_a,); half the range of a bounded action, else one, where None
     :param initial_lcs: start from this model (copied); n_contacts and the scales are then those of the model
+    :param target_noise: how far rollouts may take place from the target, in scaled units, so that contacts out of the
+        controller's way are found (exploration.py); 0 for nowhere else. Predictions are not concerned
     :param kwargs: further arguments of ``ActorCriticPolicy``
     :raise ValueError: for spaces or arguments that the controller has no use for; the message says which
     """
@@ -109,6 +116,7 @@ class MpcLcsPolicy(ActorCriticPolicy):
         state_scale: ArrayLike | None = None,
         action_scale: ArrayLike | None = None,
         initial_lcs: LinearComplementaritySystem | None = None,
+        target_noise: float = 0.0,
         **kwargs: Any,
     ) -> None:
         n_states, n_actions = _check_spaces(observation_space, action_space)
@@ -143,7 +151,7 @@ class MpcLcsPolicy(ActorCriticPolicy):
             smoothing=smoothing, n_iterations=n_iterations, solver=solver, check=check, prediction_coef=prediction_coef,
             preset=preset, prediction_loss=prediction_loss, model_fit=model_fit, policy_gradient=policy_gradient,
             replay=replay, state_scale=state_scale, action_scale=action_scale, initial_lcs=initial_lcs,
-            log_std_init=log_std_init,
+            log_std_init=log_std_init, target_noise=target_noise,
         )  # fmt: skip
         self._sizes = n_states, n_actions
         super().__init__(
@@ -188,6 +196,8 @@ class MpcLcsPolicy(ActorCriticPolicy):
         self.store = TransitionStore(*self._sizes)
         self._loss_data: tuple[torch.Tensor, ...] | None = None
         self._losses: list[float] = []
+        self._target = WanderingTarget(*self._sizes, given["target_noise"])
+        self._is_exploring = False
         self._warned_of_flat_reward = False
         self.optimizer = self.optimizer_class(self.parameters(), lr=lr_schedule(1), **self.optimizer_kwargs)  # type: ignore[call-arg]
 
@@ -273,6 +283,28 @@ class MpcLcsPolicy(ActorCriticPolicy):
         mean: torch.Tensor = self.mpc(BasePolicy.extract_features(self, observation, self.pi_features_extractor))
         return mean
 
+    def forward(
+        self, obs: torch.Tensor, deterministic: bool = False
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """As in the base class. Rollouts are collected by this, so the target is the one that wanders."""
+        with self._exploring():
+            return super().forward(obs, deterministic)
+
+    @contextlib.contextmanager
+    def _exploring(self) -> Iterator[None]:
+        self._is_exploring = True
+        try:
+            yield
+        finally:
+            self._is_exploring = False
+
+    def _get_action_dist_from_latent(self, latent_pi: torch.Tensor) -> Distribution:
+        if not (self._is_exploring and self._target.is_shifted):
+            return super()._get_action_dist_from_latent(latent_pi)
+        state, action = (latent_pi.new_tensor(part) for part in (self._target.state, self._target.action))
+        assert isinstance(self.action_dist, DiagGaussianDistribution)
+        return self.action_dist.proba_distribution(self.mpc(latent_pi - state) + action, self.log_std)
+
     def set_training_mode(self, mode: bool) -> None:
         """As in the base class, which visits every module for each action, also where nothing changes."""
         if mode != self.training:
@@ -285,16 +317,17 @@ class MpcLcsPolicy(ActorCriticPolicy):
 
         :raise RuntimeError: while training, where no transitions have been handed over
         """
-        if not torch.is_grad_enabled():
-            return super().evaluate_actions(obs, actions)
-        if self._mpc_arguments["policy_gradient"]:
-            values, log_prob, entropy = super().evaluate_actions(obs, actions)
-        else:
-            self.lcs.requires_grad_(False)
-            try:
+        with self._exploring():
+            if not torch.is_grad_enabled():
+                return super().evaluate_actions(obs, actions)
+            if self._mpc_arguments["policy_gradient"]:
                 values, log_prob, entropy = super().evaluate_actions(obs, actions)
-            finally:
-                self.lcs.requires_grad_(True)
+            else:
+                self.lcs.requires_grad_(False)
+                try:
+                    values, log_prob, entropy = super().evaluate_actions(obs, actions)
+                finally:
+                    self.lcs.requires_grad_(True)
         # it keeps the graph of this batch, and a policy that holds a graph cannot be copied
         self.action_dist.distribution = None  # type: ignore[assignment]  # as in a new policy
         loss = self.prediction_loss()
@@ -343,16 +376,28 @@ class MpcLcsPolicy(ActorCriticPolicy):
                     self._warn_of_flat_reward()
                 cost, log["train/reward_loss"] = fit_cost(data.s, data.a, data.reward, *scales)
                 self.mpc.set_cost(cost)
-            if self._mpc_arguments["model_fit"] == "least_squares":
-                log["train/model_fit_error"] = fit_tangent(
-                    self.lcs, data, self.mpc.target(), self._mpc_arguments["initial_lcs"]
-                )
+            target, prior = self.mpc.target(), self._mpc_arguments["initial_lcs"]
+            if self._mpc_arguments["model_fit"] == "contacts" and self.lcs.n_contacts:
+                log["train/n_contacts"] = fit_contacts(self.lcs, data, target, prior)
+            if self._mpc_arguments["model_fit"] != "gradient":
+                log["train/model_fit_error"] = fit_tangent(self.lcs, data, target, prior)
+            self._target.move(self.lcs)
+        self._limit_noise()
         if self._losses:
             log["train/prediction_loss"] = float(np.mean(self._losses))
         self._loss_data = None  # the next update needs its own
         critic = self.value_net if isinstance(self.value_net, QuadraticCritic) else None
         self.mpc.refresh(critic, reward_scale)
         return log | self._controller_log()
+
+    def end_training(self) -> None:
+        """Training ended: nothing explores any more."""
+        self._target.reset()
+
+    @torch.no_grad()
+    def _limit_noise(self) -> None:
+        half_range = (self.mpc.action_high - self.mpc.action_low) / 2
+        self.log_std.clamp_(max=self.log_std.new_tensor(np.log(MOST_NOISE * half_range)))
 
     def _set_scale(self) -> None:
         """Freeze the state scale, the spread of the first rollout, before anything is learned in its units."""
