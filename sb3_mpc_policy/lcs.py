@@ -12,6 +12,7 @@ optimiser's step means the same for metres, radians and newtons. Everything publ
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
@@ -20,7 +21,7 @@ from torch import nn
 
 from sb3_mpc_policy.lcp import solve_lcp
 
-__all__ = ["LcsMatrices", "LinearComplementaritySystem"]
+__all__ = ["LcsMatrices", "LinearComplementaritySystem", "of_contacts"]
 
 # Least eigenvalue of the symmetric part of F in scaled coordinates, relative to gaps and forces of size one.
 KAPPA = 1e-3
@@ -41,6 +42,12 @@ class LcsMatrices(NamedTuple, Generic[Matrix]):
     E: Matrix
     F: Matrix
     c: Matrix
+
+
+def of_contacts(model: LcsMatrices[Matrix], index: np.ndarray) -> LcsMatrices[Matrix]:
+    """The same model with these contacts only."""
+    A, B, C, d, D, E, F, c = model
+    return LcsMatrices(A, B, C[:, index], d, D[index], E[index], F[index][:, index], c[index])
 
 
 class LinearComplementaritySystem(nn.Module):
@@ -255,6 +262,28 @@ class LinearComplementaritySystem(nn.Module):
     E = property(lambda self: self.matrices().E, doc="(n_lambda, n_a), eq (5b), environment units")
     F = property(lambda self: self.matrices().F, doc="(n_lambda, n_lambda), eq (5b), environment units")
     c = property(lambda self: self.matrices().c, doc="(n_lambda,), eq (5b), environment units")
+
+    def describe(
+        self, states: Sequence[tuple[str, str]] | None = None, actions: Sequence[tuple[str, str]] | None = None
+    ) -> str:
+        """The contacts in words and units, for instance::
+
+            2 of 2 contacts in use
+            contact 1: touches where x + 0.600 theta + 0.00500 x_dot > 0.350 m
+              along x alone: at x = 0.350 m (open below)
+              each m beyond it changes, in one step: theta_dot by -60.4 rad/s, x_dot by +2.80 m/s, ...
+
+        Each gap is given in the unit of the state that matters most to it, with that state's coefficient one; what a
+        contact changes is ``C_k / F_kk`` for each unit its gap would close. Terms under 1 % of the largest, in scaled
+        coordinates, are left out. A contact is not in use where its column of C is zero.
+
+        :param states: (name, unit) of each state, such as ``("x", "m")``; ``("s[0]", "")`` and so on where None
+        :param actions: likewise; ``("a[0]", "")`` and so on where None
+        :raise ValueError: for another number of names, or anything else than pairs of strings
+        """
+        from sb3_mpc_policy.description import describe
+
+        return describe(self, states, actions)
 
     def extra_repr(self) -> str:
         return f"n_states={self.n_states}, n_actions={self.n_actions}, n_contacts={self.n_contacts}"

@@ -29,7 +29,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from sb3_mpc_policy.lcs import LcsMatrices, LinearComplementaritySystem
+from sb3_mpc_policy.lcs import LcsMatrices, LinearComplementaritySystem, Matrix, of_contacts
 from sb3_mpc_policy.lqr import affine_lqr
 from sb3_mpc_policy.problem import ComplementarityWeights, RelaxedProblem
 from sb3_mpc_policy.reward import QuadraticCost, QuadraticReward, flat_cost
@@ -167,6 +167,7 @@ class LcsMpc(nn.Module):
         self._problem: RelaxedProblem | None = None
         self._problem_key: bytes = b""
         self._simulator: LcsSimulator
+        self._used = np.arange(lcs.n_contacts)
 
         n_x, n_a = lcs.n_states, lcs.n_actions
         for name, shape in (
@@ -231,6 +232,10 @@ class LcsMpc(nn.Module):
     def _numpy_model(self) -> LcsMatrices[np.ndarray]:
         return LcsMatrices(*(matrix.detach().cpu().numpy() for matrix in self.lcs.scaled()))
 
+    def _of_used(self, model: LcsMatrices[Matrix]) -> LcsMatrices[Matrix]:
+        """A model without the contacts that :meth:`_current_problem` has found to do nothing."""
+        return model if len(self._used) == self.lcs.n_contacts else of_contacts(model, self._used)
+
     def _scaled_cost(self) -> tuple[np.ndarray, np.ndarray]:
         scale = np.concatenate([self._numpy("state_scale", self.lcs), self._numpy("action_scale", self.lcs)])
         W = self._numpy("cost_weight") * np.outer(scale, scale)
@@ -246,8 +251,10 @@ class LcsMpc(nn.Module):
         if self._problem is None or key != self._problem_key:
             W, w = self._scaled_cost()
             action_scale = self._numpy("action_scale", self.lcs)
+            model = self._numpy_model()
+            self._used = _in_use(model)
             self._problem = RelaxedProblem(
-                model=LcsMatrices(*(matrix.copy() for matrix in self._numpy_model())),
+                model=LcsMatrices(*(matrix.copy() for matrix in self._of_used(model))),
                 stage_weight=W,
                 stage_slope=w,
                 terminal_weight=self._numpy("terminal_weight").copy(),
@@ -392,15 +399,28 @@ class LcsMpc(nn.Module):
             shifted = np.concatenate([previous.actions[:, 1:], previous.actions[:, -1:]], axis=1) / action_scale
         problem = self._current_problem()
         solution, _, cost = self._solve(problem, state / self._numpy("state_scale", self.lcs), shifted)
+        forces, gaps = self._of_all_contacts(solution)
         return MpcPlan(
             actions=solution.actions * action_scale,
             states=solution.states * self._numpy("state_scale", self.lcs),
-            contact_forces=solution.forces * self._numpy("force_scale", self.lcs),
-            gaps=solution.gaps * self._numpy("gap_scale", self.lcs),
+            contact_forces=forces * self._numpy("force_scale", self.lcs),
+            gaps=gaps * self._numpy("gap_scale", self.lcs),
             cost=cost,
             complementarity=_complementarity(solution),
             status=np.where(solution.solved, "solved", "fallback"),
         )
+
+    def _of_all_contacts(self, solution: Solution) -> tuple[np.ndarray, np.ndarray]:
+        """Forces and gaps (N, H, n_lambda), those of contacts that do nothing as they follow from the plan."""
+        if len(self._used) == self.lcs.n_contacts:
+            return solution.forces, solution.gaps
+        _, _, _, _, D, E, F, c = self._numpy_model()
+        gaps = solution.states[:, :-1] @ D.T + solution.actions @ E.T + c
+        forces = np.maximum(-gaps / np.diag(F), 0.0)
+        forces[..., self._used] = solution.forces
+        gaps += forces * np.diag(F)
+        gaps[..., self._used] = solution.gaps
+        return forces, gaps
 
     def forward(self, s: torch.Tensor) -> torch.Tensor:
         """The first action of the plan, the policy's mean mu(s), differentiable in the model and in s.
@@ -421,7 +441,8 @@ class LcsMpc(nn.Module):
         if torch.is_grad_enabled() and solution.solved.any():
             index = np.flatnonzero(solution.solved)
             some = ComplementarityWeights(weights.gap[index], weights.force[index])
-            found = self.solver.differentiable_actions(problem, self.lcs.scaled(), scaled[index], some, solution[index])
+            model = self._of_used(self.lcs.scaled())
+            found = self.solver.differentiable_actions(problem, model, scaled[index], some, solution[index])
             actions = actions.index_put((torch.as_tensor(index, device=s.device),), found[:, 0])
         return (actions * self.lcs.action_scale).to(s.dtype)
 
@@ -438,6 +459,13 @@ class LcsMpc(nn.Module):
 def _mean_weight(W: np.ndarray) -> float:
     """The size of the cost in scaled coordinates, to which penalty and regularisation are relative."""
     return max(float(np.trace(W)) / len(W), 1e-12)
+
+
+def _in_use(model: LcsMatrices[np.ndarray]) -> np.ndarray:
+    """Index of the contacts that move the state, or are coupled to others and so may."""
+    coupled = model.F.copy()
+    np.fill_diagonal(coupled, 0.0)
+    return np.flatnonzero(model.C.any(axis=0) | coupled.any(axis=0) | coupled.any(axis=1))
 
 
 def _in_contact(problem: RelaxedProblem, weights: ComplementarityWeights) -> np.ndarray:

@@ -35,6 +35,8 @@ __all__ = ["MpcLcsPolicy"]
 _LARGEST_LOSS_BATCH = 4096
 # The fits between rollouts take the latest of this many, so that a long run's rollouts do not take longer and longer.
 _LARGEST_FIT = 20_000
+# n_contacts="auto": room for so many.
+_AUTO_CONTACTS = 4
 # Exploration at the start, as a share of the action scale.
 _INITIAL_NOISE = 0.2
 
@@ -60,7 +62,8 @@ class MpcLcsPolicy(ActorCriticPolicy):
     :param log_std_init: logarithm of the initial standard deviation of every action, environment units; a fifth of
         the action scale where None
     :param horizon: H >= 1, control steps
-    :param n_contacts: n_lambda >= 0
+    :param n_contacts: n_lambda >= 0, with ``model_fit="contacts"`` at most so many; "auto" for as many as are found, up
+        to four. Contacts that are not in use cost no time
     :param reward: a :class:`QuadraticReward`, or its arguments as a dict; None to learn one from the rewards observed
     :param terminal_value: "riccati", "critic" or "none"
     :param penalty: rho of the relaxation's first pass, relative to the size of the cost; it stiffens from pass to pass
@@ -99,7 +102,7 @@ class MpcLcsPolicy(ActorCriticPolicy):
         log_std_init: float | None = None,
         *,
         horizon: int = 10,
-        n_contacts: int = 2,
+        n_contacts: int | str = 2,
         reward: QuadraticReward | dict[str, Any] | None = None,
         terminal_value: str = "riccati",
         penalty: float = 100.0,
@@ -141,6 +144,11 @@ class MpcLcsPolicy(ActorCriticPolicy):
         ):
             if value not in accepted:
                 raise ValueError(f"{name} must be one of {sorted(accepted)}, got {value!r}")
+        if isinstance(n_contacts, str) and (n_contacts != "auto" or model_fit != "contacts"):
+            raise ValueError(
+                "n_contacts must be an integer >= 0, or 'auto' with model_fit='contacts'; "
+                f"got {n_contacts!r} with model_fit={model_fit!r}"
+            )
         if isinstance(reward, dict):
             reward = QuadraticReward(**reward)
         if reward is not None and not isinstance(reward, QuadraticReward):
@@ -484,4 +492,5 @@ def _make_lcs(
         return copy.deepcopy(initial)
     half_range = np.where(np.isfinite(high - low), (high - low) / 2, 1.0)
     action_scale = half_range if given["action_scale"] is None else given["action_scale"]
-    return LinearComplementaritySystem(n_states, n_actions, given["n_contacts"], given["state_scale"], action_scale)
+    n_contacts = _AUTO_CONTACTS if given["n_contacts"] == "auto" else given["n_contacts"]
+    return LinearComplementaritySystem(n_states, n_actions, n_contacts, given["state_scale"], action_scale)
