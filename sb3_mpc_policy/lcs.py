@@ -271,7 +271,7 @@ class LinearComplementaritySystem(nn.Module):
             2 of 2 contacts in use
             contact 1: touches where x + 0.600 theta + 0.00500 x_dot > 0.350 m
               along x alone: at x = 0.350 m (open below)
-              each m beyond it changes, in one step: theta_dot by -60.4 rad/s, x_dot by +2.80 m/s, ...
+              each m beyond it changes, in one step: theta_dot by -60.3 rad/s, x_dot by +2.79 m/s, theta by -0.302 rad
 
         Each gap is given in the unit of the state that matters most to it, with that state's coefficient one; what a
         contact changes is ``C_k / F_kk`` for each unit its gap would close. Terms under 1 % of the largest, in scaled
