@@ -29,7 +29,7 @@ def describe(
     _, _, C, _, D, E, F, c = (matrix.detach().cpu().numpy() for matrix in lcs.matrices())
     scale = torch.cat([lcs.state_scale, lcs.action_scale]).cpu().numpy()
     in_use = set(np.flatnonzero(C.any(axis=0)).tolist())
-    lines = [f"{len(in_use)} of {lcs.n_contacts} contacts in use"]
+    lines = [f"{len(in_use)} of {lcs.n_contacts} contact{'' if lcs.n_contacts == 1 else 's'} in use"]
     for k in range(lcs.n_contacts):
         said = ["not in use"]
         if k in in_use:

@@ -148,6 +148,10 @@ def test_coupled_contacts_are_said_to_be(coupled: np.ndarray) -> None:
     assert "couples" not in two_walls(F=coupled, C=np.zeros((2, 2))).describe()
 
 
+def test_one_contact_is_not_spoken_of_as_many() -> None:
+    assert LinearComplementaritySystem(2, 1, 1).describe().startswith("1 of 1 contact in use\n")
+
+
 def test_a_linear_model_has_no_contacts() -> None:
     assert LinearComplementaritySystem(2, 1, 0).describe([("x", "m"), ("v", "m/s")]) == "no contacts"
 
