@@ -42,7 +42,7 @@ from benchmarks.references import contact_env, lqr, oracle
 from sb3_mpc_policy import LinearComplementaritySystem
 from sb3_mpc_policy.lcs import LcsMatrices
 
-ENVS = ["CartPoleSoftWallsHardPyBullet-v0", "CartPoleSoftWallsHardDrake-v0"]
+ENVS = ["CartPoleSoftWallsHardPyBullet-v0"]
 VARIANTS = ["tuned", "linear"]
 SEEDS = list(range(1000, 1010))
 TEST_SEEDS = range(2_000_000, 2_000_100)
@@ -187,8 +187,8 @@ def arguments(argv: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--env", nargs="+", default=ENVS, metavar="ID")
     parser.add_argument("--variant", nargs="+", default=VARIANTS, choices=sorted(runs.named_variants()))
     parser.add_argument("--seeds", nargs="+", type=int, default=SEEDS, metavar="N")
-    parser.add_argument("--steps", type=int, default=5_120, help="environment steps of each run")
-    parser.add_argument("--eval-every", type=int, default=128, help="environment steps between evaluations")
+    parser.add_argument("--steps", type=int, default=3_840, help="environment steps of each run")
+    parser.add_argument("--eval-every", type=int, default=256, help="environment steps between evaluations")
     parser.add_argument("--episodes", type=int, default=50, help="scored episodes of an evaluation")
     parser.add_argument("--rollouts", type=int, default=20, help="after which the walls are shown")
     parser.add_argument("--jobs", type=int, default=1, help="runs at a time, one thread each")

@@ -20,9 +20,9 @@ __all__ = ["MOST_NOISE", "WanderingTarget"]
 # action is hardly more than one bound or the other, and PPO widens it without end where actions saturate.
 MOST_NOISE = 0.5
 
-_HELD = 6  # rollouts on one side
-_APPROACH = 0.4  # share of the way there in each rollout
-_LEAST_SIZE, _LARGEST_SIZE = 0.5, 1.5  # of a shift
+_HELD = 9  # rollouts on one side
+_APPROACH = 0.6  # share of the way there in each rollout
+_LEAST_SIZE, _LARGEST_SIZE = 0.85, 1.25  # of a shift
 
 
 class WanderingTarget:

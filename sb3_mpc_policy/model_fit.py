@@ -35,7 +35,9 @@ _DEGREES = (2, 3)  # of the terms that take up curvature ...
 _MOST_TERMS = 300  # ... left out where there would be more of them than this
 _LINEAR_RIDGE = 1e-6
 _CURVATURE_RIDGE = 1e-3
+_ENOUGH = 4000  # transitions that the regression takes, at random, of more
 _REWEIGHTINGS = 30
+_SETTLED = 1e-5  # relative change of the coefficients at which reweighting ends
 _INLIERS = 0.4  # share of the data that is taken for undisturbed
 _LEAST_RESIDUAL = 1e-3  # whitened: no data are trusted beyond this
 
@@ -123,16 +125,18 @@ def _robust_regression(x: np.ndarray, u: np.ndarray, y: np.ndarray) -> tuple[np.
     """Coefficients (n_features, n_x) of y in (x, u, 1, curvature), residuals, what curvature adds, residuals' scale."""
     z = np.hstack([x, u])
     n, n_z = z.shape
-    features = np.hstack([z, np.ones((n, 1)), *_curvature(z)])
-    ridge = np.full(features.shape[1], _CURVATURE_RIDGE)
+    everything = np.hstack([z, np.ones((n, 1)), *_curvature(z)])
+    ridge = np.full(everything.shape[1], _CURVATURE_RIDGE)
     ridge[: n_z + 1] = _LINEAR_RIDGE
-    near = np.exp(-0.5 * np.square(x / _WIDTH).sum(axis=1))
-    near /= near.max()
     deviation = median_deviation(y)
-    whitened = y / deviation
+    some = np.arange(n) if n <= _ENOUGH else np.random.default_rng(n).choice(n, _ENOUGH, replace=False)
+    features, whitened = everything[some], y[some] / deviation
+    near = np.exp(-0.5 * np.square(x[some] / _WIDTH).sum(axis=1))
+    near /= near.max()
 
-    trust = np.ones(n)
+    trust, theta = np.ones(len(some)), np.zeros((features.shape[1], y.shape[1]))
     for _ in range(_REWEIGHTINGS):
+        last = theta
         weighted = features * (near * trust)[:, None]
         gram = weighted.T @ features + np.diag(ridge)
         theta = np.linalg.solve(gram, weighted.T @ whitened)
@@ -140,9 +144,11 @@ def _robust_regression(x: np.ndarray, u: np.ndarray, y: np.ndarray) -> tuple[np.
         leverage = (features * np.linalg.solve(gram, weighted.T).T).sum(axis=1)
         error = np.linalg.norm(whitened - features @ theta, axis=1) / np.sqrt(np.maximum(1.0 - leverage, 1e-3))
         size = max(1.5 * float(np.quantile(error, _INLIERS)), _LEAST_RESIDUAL)
+        if np.abs(theta - last).max() < _SETTLED * np.abs(theta).max():
+            break
         trust = 1.0 / (1.0 + np.square(error / size))
     theta = theta * deviation
-    return theta, y - features @ theta, features[:, n_z + 1 :] @ theta[n_z + 1 :], size
+    return theta, y - everything @ theta, everything[:, n_z + 1 :] @ theta[n_z + 1 :], size
 
 
 def _curvature(z: np.ndarray) -> list[np.ndarray]:
