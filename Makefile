@@ -13,7 +13,7 @@ PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS)
 SOURCES := sb3_mpc_policy envs benchmarks tests
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-slow check format benchmark benchmark-solvers docs clean
+.PHONY: help setup demo test test-slow check format benchmark benchmark-solvers benchmark-contacts docs clean
 
 help: ## list the targets
 	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1\t\2/' | expand -t 20
@@ -61,6 +61,12 @@ benchmark-solvers: setup ## the solvers' speed and accuracy and the relaxation's
 	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.solver_accuracy
 	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.relaxation
 	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.warm_start
+
+benchmark-contacts: setup ## how well contacts are found, in random systems and in training, into benchmarks/results/
+	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.contact_identification --jobs $(WORKERS)
+	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.learned_contacts --jobs $(WORKERS)
+	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.learned_contacts --jobs $(WORKERS) --env CartPoleSoftWallsHardDrake-v0 \
+		--variant tuned --eval-every 640 --episodes 10 --output benchmarks/results/learned_contacts_drake.csv
 
 docs: setup ## build the documentation into docs/_build/html
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]'

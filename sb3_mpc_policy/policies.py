@@ -74,7 +74,7 @@ class MpcLcsPolicy(ActorCriticPolicy):
         does not
     :param prediction_coef: alpha of eq (15)
     :param preset: "default", or "paper" for Algorithm 1 as printed; sets ``prediction_loss``, ``model_fit`` and
-        ``replay`` where they are None
+        ``replay`` where they are None, and whether the noise is limited to half the range of a bounded action
     :param prediction_loss: "prediction" (eq 12) or "violation" (Jin et al. 2022)
     :param model_fit: what is fitted directly between rollouts: "contacts" for the whole model, "least_squares" for A, B
         and d only, or "gradient" for nothing, eq (16) alone
@@ -390,7 +390,8 @@ class MpcLcsPolicy(ActorCriticPolicy):
             if self._mpc_arguments["model_fit"] != "gradient":
                 log["train/model_fit_error"] = fit_tangent(self.lcs, data, target, prior)
             self._target.move(self.lcs)
-        self._limit_noise()
+        if self._mpc_arguments["preset"] != "paper":
+            self._limit_noise()
         if self._losses:
             log["train/prediction_loss"] = float(np.mean(self._losses))
         self._loss_data = None  # the next update needs its own

@@ -10,7 +10,9 @@ from stable_baselines3.common.monitor import Monitor
 
 import sb3_mpc_policy
 from benchmarks.evaluation import SOLVED, score
+from benchmarks.learned_contacts import walls
 from benchmarks.references import oracle
+from sb3_mpc_policy.lcs import LcsMatrices
 
 ENGINES = ("CartPoleSoftWalls-v0", "CartPoleSoftWallsPyBullet-v0")
 
@@ -64,3 +66,19 @@ def test_the_inverted_pendulum_reaches_its_maximum_return_within_30_episodes(see
 def test_pendulum_runs_with_no_arguments() -> None:
     model = PPO("MpcLcsPolicy", "Pendulum-v1", seed=0).learn(2_000)
     assert all(np.isfinite(parameter.detach().numpy()).all() for parameter in model.policy.parameters())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(3))
+def test_contacts_stay_silent_where_there_are_none(seed: int) -> None:
+    model, returns = train("InvertedPendulum-v5", seed, steps=1_500, n_contacts="auto")
+    assert not model.policy.lcs.C.detach().numpy().any()
+    assert max(returns) == 1_000.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("env_id", ["CartPoleSoftWallsHard-v0", "CartPoleSoftWallsHardPyBullet-v0"])
+def test_the_walls_are_found_within_a_centimetre(env_id: str) -> None:
+    model, _ = train(env_id, seed=0, steps=3_840)
+    learned = walls(LcsMatrices(*(part.detach().numpy() for part in model.policy.lcs.matrices())))
+    np.testing.assert_allclose(sorted(wall.position for wall in learned), [-0.35, 0.35], atol=0.01)
