@@ -67,6 +67,7 @@ benchmark-contacts: setup ## how well contacts are found, in random systems and 
 	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.learned_contacts --jobs $(WORKERS)
 	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.learned_contacts --jobs $(WORKERS) --env CartPoleSoftWallsHardDrake-v0 \
 		--variant tuned --eval-every 640 --episodes 10 --output benchmarks/results/learned_contacts_drake.csv
+	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.fit_speed
 
 docs: setup ## build the documentation into docs/_build/html
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]'
