@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import copy
+from collections.abc import Callable, Iterable
+from functools import partial
 
 import gymnasium as gym
 import numpy as np
@@ -174,6 +176,7 @@ def test_the_smooth_part_is_not_touched_and_gaps_have_a_slope_of_one_in_scaled_c
     gaps = torch.cat([lcs.D_scaled, lcs.E_scaled], dim=1).detach().numpy()
     np.testing.assert_allclose(np.linalg.norm(gaps, axis=1), np.arange(3) < found)
     np.testing.assert_allclose(lcs.F_scaled.detach(), np.eye(3), atol=1e-12)
+    assert (lcs.c_scaled[found:] > 0.0).all()  # those not in use are open everywhere
 
 
 # -- or there are none -----------------------------------------------------------------------------------------
@@ -190,6 +193,19 @@ def test_without_contact_in_the_data_there_is_none_in_the_model_which_then_predi
     wide = 10.0 * data.s
     assert not lcs.contact_force(wide, data.a).any()
     assert torch.equal(lcs.step(wide, data.a), plain.step(wide, data.a))
+
+
+@pytest.mark.parametrize("share", [0.05, 0.2, 0.5])
+def test_noise_in_the_data_is_not_taken_for_contact(share: float) -> None:
+    """Of this share of a step; where it is small enough, walls are still seen through it."""
+    for seed in (0, 2):
+        for far in (True, False):
+            data, rng = episodes(seed, far=far), np.random.default_rng(seed)
+            noise = share * (data.s_next - data.s).std(axis=0) * rng.normal(size=data.s.shape)
+            lcs, found = fitted(data._replace(s_next=data.s_next + noise), 3)
+            assert found == (0 if far or share > 0.1 else 2)
+            if found:
+                np.testing.assert_allclose(np.sort(positions(lcs)), [LEFT, RIGHT], atol=0.02 * RANGE)
 
 
 def test_contacts_that_the_data_refute_are_forgotten() -> None:
@@ -236,6 +252,8 @@ def push(lcs: LinearComplementaritySystem, x: float) -> np.ndarray:
 
 def test_contacts_of_the_prior_that_nothing_has_touched_are_kept_exactly_and_the_others_are_learned() -> None:
     prior = known(3.0, -0.37, -4.0)
+    with torch.no_grad():
+        prior.F_factor.mul_(1.3)  # as PPO's gradient may
     lcs, found = fitted(episodes(0), prior=prior)
     assert found == 3  # of the walls that were touched there is room for one
     assert np.abs(positions(lcs) - RIGHT).min() < 0.02 * RANGE or np.abs(positions(lcs) - LEFT).min() < 0.02 * RANGE
@@ -320,11 +338,15 @@ def test_the_units_of_states_and_actions_do_not_matter(powers: list[int]) -> Non
 def test_a_mirrored_world_has_mirrored_walls(seed: int) -> None:
     data = episodes(seed, n=60)
     one, two = model(), model()
+    signs = {"C_scaled": -1.0, "D_scaled": -1.0, "E_scaled": -1.0, "c_scaled": 1.0}
+    with torch.no_grad():
+        for name, sign in signs.items():
+            getattr(two, name).mul_(sign)
     found = fit_contacts(one, data, ORIGIN)
     assert found == fit_contacts(two, in_units(data, -np.ones(4), -np.ones(1)), ORIGIN) > 0
-    for name, sign in (("C_scaled", -1.0), ("D_scaled", -1.0), ("E_scaled", -1.0), ("c_scaled", 1.0)):
+    for name, sign in signs.items():
         mine, others = (getattr(lcs, name).detach() for lcs in (one, two))
-        torch.testing.assert_close(others, sign * mine, rtol=5e-3, atol=5e-3)
+        torch.testing.assert_close(others, sign * mine, rtol=1e-4, atol=1e-4)
 
 
 def test_the_order_of_the_transitions_does_not_matter(data: Transitions) -> None:
@@ -350,16 +372,19 @@ def test_the_global_random_state_is_neither_used_nor_touched(data: Transitions) 
 HARD = "CartPoleSoftWallsHardPyBullet-v0"
 
 
-def cart_pole_transitions(seed: int, n: int = 24, length: int = 50) -> tuple[Transitions, np.ndarray]:
-    """Of LQR with noise that starts on its way to a wall, and (N, 2) whether each wall pushed."""
-    rng, rows, touched = np.random.default_rng(seed), [], []
-    regulator = lqr(HARD)
+Controller = Callable[[np.ndarray], np.ndarray]
+
+
+def cart_pole_transitions(
+    rng: np.random.Generator, episodes: Iterable[tuple[np.ndarray, Controller]]
+) -> tuple[Transitions, np.ndarray]:
+    """Of 50 steps from each start, under a controller and noise, and (N, 2) whether each wall pushed."""
+    rows, touched = [], []
     with contextlib.closing(gym.make(HARD)) as env:
-        for i in range(n):
-            start = np.array([0.25, 0.6, 0.05, 0.2]) * (1 - 2 * (i % 2)) * rng.uniform(0.5, 1.3, 4)
+        for start, controller in episodes:
             s, _ = env.reset(options={"state": start})
-            for _ in range(length):
-                a = np.clip(regulator(s[None])[0] + 0.3 * rng.normal(size=1), -1.0, 1.0).astype(np.float32)
+            for _ in range(50):
+                a = np.clip(controller(s) + 0.3 * rng.normal(size=1), -1.0, 1.0).astype(np.float32)
                 s_next, reward, terminated, truncated, info = env.step(a)
                 rows.append(np.concatenate([s, a, [reward], s_next]))
                 touched.append(info[env.unwrapped.CONTACT_FORCES])  # type: ignore[attr-defined]
@@ -370,17 +395,43 @@ def cart_pole_transitions(seed: int, n: int = 24, length: int = 50) -> tuple[Tra
     return Transitions(s, a, reward[:, 0], s_next), np.array(touched) > 0.0
 
 
+def regulated(seed: int, n: int = 24) -> tuple[Transitions, np.ndarray]:
+    """LQR that starts on its way to a wall, to the right and to the left in turn."""
+    rng, regulator = np.random.default_rng(seed), lqr(HARD)
+    starts = np.array([0.25, 0.6, 0.05, 0.2]) * rng.uniform(0.5, 1.3, (n, 4))
+    starts[1::2] *= -1.0
+    return cart_pole_transitions(rng, [(start, lambda s: regulator(s[None])[0]) for start in starts])
+
+
+def fallen(seed: int, n: int) -> tuple[Transitions, np.ndarray]:
+    """Random feedback, under which the pole falls."""
+    rng = np.random.default_rng(seed)
+    starts = rng.uniform(-1.0, 1.0, (n, 4)) * [0.35, 1.0, 0.3, 1.0]
+    gains = 0.5 * rng.normal(size=(n, 4))
+    return cart_pole_transitions(rng, [(s, partial(np.dot, gain)) for s, gain in zip(starts, gains, strict=True)])
+
+
 def test_the_walls_of_the_hard_cart_pole_are_found_from_a_regulator_that_meets_them() -> None:
-    data, touched = cart_pole_transitions(0)
+    data, touched = regulated(0)
     assert len(data.s) < 1_500 and (touched.sum(axis=0) >= 20).all()
     lcs, found = fitted(data)
     assert found == 2
     np.testing.assert_allclose(np.sort(positions(lcs)), [-0.35, 0.35], atol=0.02)
 
-    unseen, touched = cart_pole_transitions(1)
+    unseen, touched = regulated(1)
     hits = unseen.take(np.flatnonzero(touched.any(axis=1)))
     with contact_env(HARD) as plant:
         true = LinearComplementaritySystem.from_matrices(*plant.true_lcs())
     learned, known, without = (errors(some, hits) for some in (lcs, true, fitted(data, 0)[0]))
     assert (learned < without / 5.0).all()
     assert (learned < 2.0 * known).all()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_they_are_found_among_falls_where_the_pole_leans_on_a_wall_and_nothing_is_linear(seed: int) -> None:
+    good, bad = regulated(seed, 6)[0], fallen(seed, 90)[0]
+    data = Transitions(*(np.concatenate(both) for both in zip(good, bad, strict=True)))
+    assert len(bad.s) > 8 * len(good.s) and np.abs(bad.s[:, 2]).max() > 1.0
+    lcs, found = fitted(data)
+    assert found == 2
+    np.testing.assert_allclose(np.sort(positions(lcs)), [-0.35, 0.35], atol=0.02)
