@@ -58,7 +58,8 @@ def fit_contacts(
     untested = _untested(lcs, data, prior)
     rng = np.random.default_rng(len(data.s))  # not the global one, which the training has
     surprises = Surprises(z, smooth.surprise / unit, near, noise, drift, unit, rng)
-    found = find_hinges(surprises, lcs.n_contacts - untested.n, _hinges(lcs, unit))
+    start, most = _hinges(lcs, unit), lcs.n_contacts - untested.n
+    found = find_hinges(surprises, most, start if start.n <= most else Hinges.none(lcs.n_states, z.shape[1]))
     _assign(lcs, untested.plus(found.C * unit[:, None], found.P))
     return untested.n + found.n
 
@@ -69,8 +70,10 @@ def _noise(bent: np.ndarray, surprise: np.ndarray) -> np.ndarray:
     It grows with the curvature. Where contact is so frequent that the median does not see past it, what holds for
     transitions of more curvature holds there too.
     """
-    order = np.argsort(bent)
-    local = median_filter(surprise[order], max(_LEAST_WINDOW, len(order) // _WINDOWS), mode="nearest")
+    order, window = np.argsort(bent), max(_LEAST_WINDOW, len(bent) // _WINDOWS)
+    local, half = median_filter(surprise[order], window, mode="nearest"), window // 2
+    if len(order) > 2 * half:  # at the ends the window stays inside: no transition counts twice
+        local[:half], local[-half:] = local[half], local[-half - 1]
     noise = np.empty(len(order))
     noise[order] = _MEDIANS * np.minimum.accumulate(local[::-1])[::-1]
     return noise
@@ -81,17 +84,23 @@ def _untested(lcs: LinearComplementaritySystem, data: Transitions, prior: Linear
     if prior is None:
         return Hinges.none(lcs.n_states, lcs.n_states + lcs.n_actions + 1)
     known = _hinges(prior, np.ones(lcs.n_states))
-    forces = prior.contact_force(data.s, data.a).cpu().numpy()
+    forces = prior.contact_force(data.s, data.a).cpu().numpy()[:, _acting(prior)]
     idle = np.flatnonzero(~(forces > 0.0).any(axis=0))
     return Hinges(known.C[:, idle], known.P[idle])
 
 
+def _acting(lcs: LinearComplementaritySystem) -> np.ndarray:
+    """(n_lambda,) bool: the contacts that do something, and whose gap something moves."""
+    C, D, E = (part.detach().cpu().numpy() for part in (lcs.C_scaled, lcs.D_scaled, lcs.E_scaled))
+    return np.logical_and(C.any(axis=0), np.hstack([D, E]).any(axis=1))
+
+
 def _hinges(lcs: LinearComplementaritySystem, unit: np.ndarray) -> Hinges:
-    """The contacts of a model that do something, each as if it were alone."""
+    """The contacts of a model that act, each as if it were alone."""
     _, _, C, _, D, E, F, c = (part.detach().cpu().numpy() for part in lcs.scaled())
     rows = np.hstack([D, E, c[:, None]]) / np.diag(F)[:, None]
-    active = C.any(axis=0)
-    return Hinges(C[:, active] / unit[:, None], rows[active])
+    acting = _acting(lcs)
+    return Hinges(C[:, acting] / unit[:, None], rows[acting])
 
 
 def _assign(lcs: LinearComplementaritySystem, hinges: Hinges) -> None:

@@ -22,13 +22,13 @@ MOST_NOISE = 0.5
 
 _HELD = 9  # rollouts on one side
 _APPROACH = 0.6  # share of the way there in each rollout
-_LEAST_SIZE, _LARGEST_SIZE = 0.85, 1.25  # of a shift
+_LEAST_SIZE, _LARGEST_SIZE = 1.0, 1.3  # of a shift
 
 
 class WanderingTarget:
     """The shift of the rollouts' target.
 
-    :param size: >= 0, typical size of ``(s_e, a_e)`` in scaled units; 0 for none
+    :param size: >= 0, least size of ``(s_e, a_e)`` in scaled units; 0 for none
     """
 
     def __init__(self, n_states: int, n_actions: int, size: float) -> None:
@@ -40,7 +40,8 @@ class WanderingTarget:
     def reset(self) -> None:
         """Back to the target itself."""
         self.state, self.action = np.zeros(self.n_states), np.zeros(self.n_actions)
-        self._goal = np.zeros(self.n_actions)
+        self._goal = np.zeros(self.n_states + self.n_actions)
+        self._spread = 0.0
         self._moves = 0
 
     @property
@@ -56,16 +57,17 @@ class WanderingTarget:
         if not self.size:
             return
         if self._moves % (2 * _HELD) == 0:
-            direction = torch.randn(self.n_actions, dtype=torch.float64).numpy()
-            spread = _LEAST_SIZE + (_LARGEST_SIZE - _LEAST_SIZE) * torch.rand(1).item()
-            self._goal = spread * direction / np.linalg.norm(direction)
+            self._goal = torch.randn(self.n_states + self.n_actions, dtype=torch.float64).numpy()
+            self._spread = _LEAST_SIZE + (_LARGEST_SIZE - _LEAST_SIZE) * torch.rand(1).item()
         elif self._moves % _HELD == 0:
             self._goal = -self._goal
         self._moves += 1
         A, B = (part.cpu().numpy() for part in (lcs.A_scaled, lcs.B_scaled))
         # (A − I) s_e + B a_e = 0: at least as many directions as there are actions
         steady = np.linalg.svd(np.hstack([A - np.eye(self.n_states), B]))[2][self.n_states :]
-        goal = self.size * self._goal @ steady
+        # the one nearest to the goal: singular vectors alone come with either sign, and turn where the model changes
+        goal = steady.T @ (steady @ self._goal)
+        goal *= self.size * self._spread / np.linalg.norm(goal)
         scale = lcs.state_scale.cpu().numpy(), lcs.action_scale.cpu().numpy()
         self.state += _APPROACH * (goal[: self.n_states] * scale[0] - self.state)
         self.action += _APPROACH * (goal[self.n_states :] * scale[1] - self.action)
