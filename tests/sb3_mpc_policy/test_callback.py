@@ -28,7 +28,7 @@ VEC_ENVS: dict[str, Callable[[], Any]] = {
 @pytest.mark.parametrize("name", sorted(VEC_ENVS))
 def test_the_recorded_transitions_are_those_that_happened_inside_the_environment(name: str) -> None:
     env = VEC_ENVS[name]()
-    # a noise of one on an action within ±0.5: many actions are clipped
+    # the widest noise that there is: some actions are clipped
     model = small_ppo(env, n_steps=48, log_std_init=0.0).learn(48)
     truth, rows = recorded(env), policy_of(model).store.rows()
     env.close()

@@ -204,6 +204,7 @@ def test_a_model_that_overflows_within_the_horizon_is_unsolved_without_a_warning
 
 IN_TRAINING: list[tuple[str, dict[str, Any]]] = [
     *((name, {}) for name, case in CASES.items() if np.isfinite(case.low)),
+    *((name, dict(model_fit="contacts")) for name, case in CASES.items() if np.isfinite(case.low)),
     ("one contact twice", dict(solver="torch")),
     ("everything 1e8", dict(solver="torch")),
     ("everything 1e8, many contacts", dict(prediction_loss="violation")),

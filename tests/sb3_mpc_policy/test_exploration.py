@@ -86,7 +86,6 @@ def test_each_side_is_held_for_some_rollouts(cart_pole: ModelFactory) -> None:
     assert len(changes) > 10 and np.diff(changes).min() >= 3
 
 
-@pytest.mark.xfail(strict=True, reason="the singular vectors that move() takes come with either sign")
 def test_a_model_that_changes_a_little_keeps_the_target_on_its_side(cart_pole: ModelFactory) -> None:
     """The model is fitted anew after each rollout."""
     still, restless, rng, path = cart_pole(), cart_pole(), np.random.default_rng(0), []

@@ -30,12 +30,13 @@ ARGUMENTS: dict[str, dict[str, Any]] = {
         prediction_loss="violation", model_fit="gradient", policy_gradient=False, replay=False,
         state_scale=[0.4, 0.9], action_scale=[0.3], normalize_images=False,
         share_features_extractor=False, optimizer_class=torch.optim.SGD, optimizer_kwargs=dict(momentum=0.5),
-        features_extractor_kwargs={},
+        features_extractor_kwargs={}, target_noise=0.7,
     ),
     "two": dict(
         terminal_value="critic", preset="paper", initial_lcs=LinearComplementaritySystem(2, 1, 1, [0.5, 0.7], [0.4]),
         reward=dict(state_weight=[1.0, 2.0], action_weight=0.3), solver="cvxpylayers", horizon=2,
     ),
+    "auto": dict(n_contacts="auto", target_noise=0.5),
     "defaults": {},
 }  # fmt: skip
 # Not of this policy: what PPO passes, what is refused when it is not the default, and gSDE's.
