@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import copy
+
 import numpy as np
 import pytest
 import torch
 
 from sb3_mpc_policy import LinearComplementaritySystem
-from sb3_mpc_policy.model_fit import fit_tangent
+from sb3_mpc_policy.model_fit import fit_tangent, smooth_fit
 from sb3_mpc_policy.transitions import Transitions
+from tests.sb3_mpc_policy.toy_environments import fingerprint
 
 STEP = 0.05
 
@@ -166,3 +169,82 @@ def test_a_system_of_many_dimensions_is_fitted() -> None:
     fit_tangent(lcs, transitions(s, a, s @ A.T + a @ B.T), np.zeros(17))
     np.testing.assert_allclose(smooth_part(lcs)[0], A, atol=1e-2)
     np.testing.assert_allclose(smooth_part(lcs)[1], B, atol=1e-2)
+
+
+# -- what the smooth part leaves: the data that contacts are found in ------------------------------------------
+
+
+def struck_pendulum(seed: int, n: int = 600) -> tuple[Transitions, np.ndarray]:
+    """Transitions of the pendulum, and (n, 2) what blows added to the next state: in one of twenty."""
+    rng = np.random.default_rng(seed)
+    s, a = rng.uniform([-1.0, -4.0], [1.0, 4.0], (n, 2)), rng.uniform(-1.0, 1.0, (n, 1))
+    blows = np.zeros((n, 2))
+    hit = rng.random(n) < 0.05
+    blows[hit, 1] = rng.choice([-1.0, 1.0], hit.sum()) * rng.uniform(0.5, 8.0, hit.sum())
+    return transitions(s, a, pendulum(s, a) + blows), blows
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.5])
+def test_a_surprise_is_what_no_smooth_dynamics_explains_and_curvature_is_what_the_tangent_does_not(
+    angle: float,
+) -> None:
+    scale, target = np.array([0.5, 2.0]), np.array([angle, 0.0])
+    data, blows = struck_pendulum(0)
+    lcs = LinearComplementaritySystem(2, 1, 0, scale, [1.0])
+    fit = smooth_fit(lcs, data, target)
+    A, B = pendulum_jacobian(angle)
+    tangent = pendulum(target[None], np.zeros((1, 1))) + (data.s - target) @ A.T + data.a @ B.T
+    np.testing.assert_allclose(fit.surprise * scale, blows, atol=0.02)
+    np.testing.assert_allclose(fit.curvature * scale, pendulum(data.s, data.a) - tangent, atol=0.03)
+    np.testing.assert_array_equal(fit.centre, target / scale)
+    assert fit.theta.shape == (3 + 1 + 6 + 10, 2) and fit.noise < 0.05
+
+
+def test_the_parts_of_a_smooth_fit_add_up_to_what_happened() -> None:
+    scale, prior = np.array([0.5, 2.0]), LinearComplementaritySystem(2, 1, 0, [0.5, 2.0], [3.0])
+    data, _ = struck_pendulum(1)
+    fit = smooth_fit(copy.deepcopy(prior), data, np.zeros(2), prior)
+    expected = prior.step(data.s, data.a).detach().numpy() / scale
+    z = np.hstack([data.s / scale - fit.centre, data.a / 3.0, np.ones((len(data.s), 1))])
+    linear = expected + z @ fit.theta[:4]
+    np.testing.assert_allclose(linear + fit.curvature + fit.surprise, data.s_next / scale, atol=1e-9)
+
+
+@pytest.mark.parametrize("with_contacts", [True, False])
+def test_a_surprise_holds_what_contact_did_whether_or_not_the_model_knows_of_it(with_contacts: bool) -> None:
+    rng = np.random.default_rng(6)
+    A, B = np.eye(2) + 0.3 * rng.normal(size=(2, 2)), rng.normal(size=(2, 1))
+    C, D = rng.normal(size=(2, 1)), np.array([[1.0, 0.2]])
+    rest = np.zeros(2), D, np.zeros((1, 1)), np.array([[0.5]]), np.ones(1)
+    truth = LinearComplementaritySystem.from_matrices(A, B, C, *rest, state_scale=[0.5, 2.0])
+    s, a = rng.normal(size=(600, 2)), rng.normal(size=(600, 1))
+    pushed = (truth.contact_force(s, a) @ truth.C.mT).detach().numpy()
+    assert 0.05 < pushed.any(axis=1).mean() < 0.25
+    before = fingerprint(truth)
+    fit = smooth_fit(truth, transitions(s, a, truth.step(s, a).detach().numpy()), np.zeros(2), None, with_contacts)
+    # where contact is not known of, curvature takes up a little of it
+    np.testing.assert_allclose(fit.surprise * [0.5, 2.0], pushed, atol=1e-4 if with_contacts else 0.05)
+    assert fingerprint(truth) == before
+
+
+def test_of_very_many_transitions_some_decide_and_all_have_a_surprise() -> None:
+    data, blows = struck_pendulum(2, 20_000)
+    lcs = LinearComplementaritySystem(2, 1, 0, [0.5, 2.0], [1.0])
+    fit = smooth_fit(lcs, data, np.zeros(2))
+    assert fit.surprise.shape == fit.curvature.shape == (20_000, 2)
+    np.testing.assert_allclose(fit.surprise * [0.5, 2.0], blows, atol=0.02)
+    assert np.isfinite(fit_tangent(lcs, data, np.zeros(2)))
+    np.testing.assert_allclose(smooth_part(lcs)[0], pendulum_jacobian(0.0)[0], atol=0.01)
+
+
+def test_the_fit_of_very_many_transitions_neither_uses_nor_touches_the_global_random_state() -> None:
+    data, _ = struck_pendulum(3, 6_000)
+    found = []
+    for seed in (0, 1):
+        np.random.seed(seed)  # noqa: NPY002 - the global state is what this is about
+        lcs = LinearComplementaritySystem(2, 1)
+        torch.manual_seed(seed)
+        before = torch.get_rng_state()
+        found.append(smooth_fit(lcs, data, np.zeros(2)).theta)
+        assert torch.equal(torch.get_rng_state(), before)
+    np.testing.assert_array_equal(*found)
