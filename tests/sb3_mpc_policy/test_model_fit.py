@@ -227,6 +227,16 @@ def test_a_surprise_holds_what_contact_did_whether_or_not_the_model_knows_of_it(
     assert fingerprint(truth) == before
 
 
+def test_without_contacts_those_of_the_model_do_not_matter() -> None:
+    data, _ = struck_pendulum(4)
+    models = [LinearComplementaritySystem(2, 1, n, [0.5, 2.0]) for n in (0, 2)]
+    with torch.no_grad():
+        models[1].c_scaled.fill_(-1.0)  # pushes everywhere
+    one, two = (smooth_fit(lcs, data, np.zeros(2), None, False) for lcs in models)
+    np.testing.assert_array_equal(one.theta, two.theta)
+    np.testing.assert_array_equal(one.surprise, two.surprise)
+
+
 def test_of_very_many_transitions_some_decide_and_all_have_a_surprise() -> None:
     data, blows = struck_pendulum(2, 20_000)
     lcs = LinearComplementaritySystem(2, 1, 0, [0.5, 2.0], [1.0])
