@@ -65,8 +65,10 @@ benchmark-solvers: setup ## the solvers' speed and accuracy and the relaxation's
 benchmark-contacts: setup ## how well contacts are found, in random systems and in training, into benchmarks/results/
 	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.contact_identification --jobs $(WORKERS)
 	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.learned_contacts --jobs $(WORKERS)
+	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.learned_contacts --jobs $(WORKERS) --variant linear --eval-every 3840 \
+		--output benchmarks/results/learned_contacts_linear.csv
 	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.learned_contacts --jobs $(WORKERS) --env CartPoleSoftWallsHardDrake-v0 \
-		--variant tuned --eval-every 640 --episodes 10 --output benchmarks/results/learned_contacts_drake.csv
+		--episodes 10 --output benchmarks/results/learned_contacts_drake.csv
 	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.fit_speed
 
 docs: setup ## build the documentation into docs/_build/html

@@ -67,8 +67,8 @@ def test_the_true_model_predicts_contact_better_than_one_without(true: LcsMatric
 
 def test_runs_leave_evaluations_and_readings(tmp_path: Path) -> None:
     output = tmp_path / "learned.csv"
-    arguments = ["--seeds", "0", "--steps", "64", "--episodes", "1", "--output", str(output)]
-    rows, readings = main(arguments)
+    run = ["--variant", "tuned", "linear", "--seeds", "0", "--steps", "64", "--episodes", "1"]
+    rows, readings = main([*run, "--output", str(output)])
     assert {row.variant for row in rows} == {"tuned", "linear"}
     assert read_rows(output) == sorted(row._replace(seconds=round(row.seconds, 2), score=round(row.score, 2),
                                                     oracle=round(row.oracle, 2)) for row in rows)  # fmt: skip
