@@ -74,7 +74,7 @@ class MpcLcsPolicy(ActorCriticPolicy):
         does not
     :param prediction_coef: alpha of eq (15)
     :param preset: "default", or "paper" for Algorithm 1 as printed; sets ``prediction_loss``, ``model_fit`` and
-        ``replay`` where they are None, and whether the noise is limited to half the range of a bounded action
+        ``replay`` where they are None, and whether noise is limited to a quarter of the range of a bounded action
     :param prediction_loss: "prediction" (eq 12) or "violation" (Jin et al. 2022)
     :param model_fit: what is fitted directly between rollouts: "contacts" for the whole model, "least_squares" for A, B
         and d only, or "gradient" for nothing, eq (16) alone
