@@ -43,7 +43,7 @@ def fit_contacts(
     :param lcs: changed in place
     :param data: N >= 1 transitions
     :param target: (n_x,) the state the controller tries to reach, environment units
-    :param prior: model whose contacts are kept where no transition has touched them
+    :param prior: model whose contacts are kept where no transition has touched them, without what couples them in F
     :return: number of contacts in use
     """
     smooth = smooth_fit(lcs, data, target, prior, with_contacts=False)

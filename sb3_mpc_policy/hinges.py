@@ -9,7 +9,7 @@ With ``F = I`` the contact term of eq (5) is a sum of *hinges*: contact k pushes
   a blow, and the blows of a fall, larger by orders of magnitude, do not drown the others;
 * the logarithm (a Cauchy loss) gives up on what no hinge explains, such as contacts far from where the model is to
   hold, which a linear gap does not describe;
-* ``near`` counts transitions by their distance from the target, as the smooth fit does;
+* ``near`` counts transitions by how nearly linear the dynamics is around them (contact_fit.py);
 * ``drift`` is how much each of z changes in a step. It makes gaps depend on what changes slowly, positions, where a
   handful of contacts leave it open, and fades as data arrive.
 
@@ -217,11 +217,11 @@ def find_hinges(surprises: Surprises, most: int, start: Hinges) -> Hinges:
     :param most: number of hinges at most
     :param start: hinges to try first, at most as many
     """
-    fit = surprises.evaluate(start.normalised())
-    for begin in (fit, surprises.evaluate(Hinges.none(len(start.C), start.P.shape[1]))):
-        found = _pruned(surprises, _grown(surprises, _pruned(surprises, surprises.descend(begin, _LONG)), most))
-        fit = min(fit, found, key=lambda fit: fit.cost) if begin is not fit else found
-    return fit.hinges
+    found = []
+    for hinges in (start.normalised(), Hinges.none(len(start.C), start.P.shape[1])):
+        begin = _pruned(surprises, surprises.descend(surprises.evaluate(hinges), _LONG))
+        found.append(_pruned(surprises, _grown(surprises, begin, most)))
+    return min(found, key=lambda fit: fit.cost).hinges
 
 
 def _grown(surprises: Surprises, fit: _Fit, most: int) -> _Fit:

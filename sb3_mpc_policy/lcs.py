@@ -224,7 +224,8 @@ class LinearComplementaritySystem(nn.Module):
     def contact_force(self, s: torch.Tensor | np.ndarray, a: torch.Tensor | np.ndarray) -> torch.Tensor:
         """The contact forces lam (5b). s: (N, n_x) or (n_x,), a likewise -> (N, n_lambda) or (n_lambda,).
 
-        Their unit is that of the model: newtons where it was started from one in newtons, else as it was learned.
+        Their unit is that of the model: newtons where it was started from one in newtons, else, and once contacts have
+        been fitted, as it was learned.
         """
         state, action, single = self._inputs(s, a)
         _, _, _, _, D, E, F, c = self.matrices()

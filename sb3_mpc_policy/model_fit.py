@@ -10,7 +10,7 @@ A and B. So the fit looks for the *tangent* at the target, by robust local polyn
 * what the contacts of the current model explain is taken off first; transitions that still do not fit, unmodelled
   contacts above all, are outliers: Cauchy weights, iteratively reweighted.
 
-The contact parameters C, D, E, F and c are left to the gradient of the prediction loss.
+The contacts C, D, E, F and c are fitted to what this leaves (contact_fit.py), or left to the gradient of eq (16).
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ from sb3_mpc_policy.transitions import Transitions
 
 __all__ = ["MODEL_FITS", "fit_tangent"]
 
-# "gradient" is the paper's Algorithm 1: nothing but eq (16) changes the model.
+# "contacts" fits the whole model, "least_squares" A, B and d; "gradient" is the paper's Algorithm 1: nothing but
+# eq (16) changes the model.
 MODEL_FITS = ("contacts", "least_squares", "gradient")
 
 _WIDTH = 2.0  # of the region, in state scales
