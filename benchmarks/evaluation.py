@@ -13,10 +13,11 @@ from __future__ import annotations
 
 import contextlib
 import copy
+import itertools
 import random
 import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeGuard
 
 import gymnasium as gym
 import numpy as np
@@ -115,9 +116,10 @@ def controller_of(model: BaseAlgorithm) -> Controller:
     trace of the evaluation, of the size of rounding errors, into training.
     """
     normalisation = model.get_vec_normalize_env()
-    # The distribution holds tensors of the last forward pass: torch refuses a deep copy, nobody needs one.
-    distribution = getattr(model.policy, "action_dist", None)
-    policy = copy.deepcopy(model.policy, memo={id(distribution): copy.copy(distribution)})
+    # A distribution holds tensors of the last forward pass: torch refuses a deep copy, nobody needs one.
+    # It belongs to the policy in on-policy algorithms, to its actor in the others.
+    distributions = [part.action_dist for part in model.policy.modules() if hasattr(part, "action_dist")]
+    policy = copy.deepcopy(model.policy, memo={id(each): copy.copy(each) for each in distributions})
 
     def act(observations: np.ndarray) -> np.ndarray:
         seen = observations if normalisation is None else normalisation.normalize_obs(observations)
@@ -138,30 +140,70 @@ def random_state_kept() -> Iterator[None]:
             np.random.set_state(numpy)  # noqa: NPY002
 
 
+class Phase(NamedTuple):
+    """A part of a training run, and how often it is evaluated."""
+
+    until: int | None
+    """Environment steps at which the part ends; None: when training does."""
+    every: int
+    """Environment steps from one evaluation to the next."""
+
+
+def evaluation_schedule(every: int | Sequence[Sequence[int | None]]) -> tuple[Phase, ...]:
+    """The one form of what may be said in two.
+
+    :param every: environment steps, or pairs (until, every), such as ``[[1280, 128], [None, 1280]]``: every 128 steps
+        in the first 1,280, then every 1,280
+    :raises ValueError: no such thing
+    """
+    pairs: Sequence[Any] = [(None, every)] if isinstance(every, int) else every
+    try:
+        phases = tuple(Phase(*pair) for pair in pairs)
+    except TypeError:
+        phases = ()
+    untils = [phase.until for phase in phases]
+    bounds = [until for until in untils[:-1] if _is_count(until)]
+    if (
+        not phases
+        or untils[-1] is not None
+        or len(bounds) < len(untils) - 1
+        or any(a >= b for a, b in itertools.pairwise(bounds))
+        or not all(_is_count(phase.every) for phase in phases)
+    ):
+        raise ValueError(
+            f"every must be a number of environment steps, at least 1, or pairs [until, every] with growing steps "
+            f"until, the last of them null; got {every!r}"
+        )
+    return phases
+
+
+def _is_count(value: object) -> TypeGuard[int]:
+    return isinstance(value, int) and not isinstance(value, bool) and value >= 1
+
+
 class EvaluationCallback(BaseCallback):
     """Scores the policy in the course of training, without touching it.
 
-    An on-policy algorithm changes its policy between rollouts only. Evaluations therefore stand where a
-    rollout begins: before the first, then wherever the last evaluation is at least ``every`` environment
-    steps ago, and once more when training ends. ``evaluations`` holds the results.
+    Algorithms change their policy between rollouts only; that a rollout of an off-policy algorithm is a single step
+    makes no difference. Evaluations therefore stand where a rollout begins: before the first, then wherever the last
+    evaluation is at least ``every`` environment steps ago, and once more when training ends. ``evaluations`` holds
+    the results.
 
     :param evaluator: holds the scored episodes
-    :param every: environment steps
+    :param every: environment steps, or pairs (until, every) of them, see :func:`evaluation_schedule`
     :param on_evaluation: called with each result, e.g. to show progress
-    :raises ValueError: ``every`` is not positive
+    :raises ValueError: ``every`` is no schedule
     """
 
     def __init__(
         self,
         evaluator: Evaluator,
-        every: int = 128,
+        every: int | Sequence[Sequence[int | None]] = 128,
         on_evaluation: Callable[[Evaluation], None] | None = None,
     ) -> None:
         super().__init__()
-        if every < 1:
-            raise ValueError(f"every must be at least 1 environment step, got {every!r}")
         self.evaluator = evaluator
-        self.every = every
+        self.schedule = evaluation_schedule(every)
         self.on_evaluation = on_evaluation
         self.evaluations: list[Evaluation] = []
         self._finished = self._under_way = 0
@@ -178,8 +220,12 @@ class EvaluationCallback(BaseCallback):
         return True
 
     def _on_rollout_start(self) -> None:
-        if not self.evaluations or self.num_timesteps - self.evaluations[-1].steps >= self.every:
+        if not self.evaluations or self.num_timesteps >= self._due(self.evaluations[-1].steps):
             self._evaluate()
+
+    def _due(self, last: int) -> int:
+        """Environment steps at which the evaluation after the one at ``last`` stands."""
+        return last + next(phase.every for phase in self.schedule if phase.until is None or last < phase.until)
 
     def _on_training_end(self) -> None:
         if self.num_timesteps > self.evaluations[-1].steps:
