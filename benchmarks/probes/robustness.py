@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import copy
 import csv
 import dataclasses
 from collections import deque
@@ -28,21 +27,20 @@ from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.envs.registration import EnvSpec, WrapperSpec
+from gymnasium.envs.registration import EnvSpec
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from benchmarks.contact_matters import ACROBOT, changed
 from benchmarks.evaluation import Controller, Evaluator, controller_of
+from benchmarks.probes import ProbeLine
+from benchmarks.probes.common import EPISODES, FEW_EPISODES, wrapped
 from benchmarks.references import contact_env, lqr, oracle
 from contact_envs.plants import AcrobotParameters, CartPoleParameters, Plant
 from sb3_mpc_policy import hyperparams
 
 __all__ = ["Change", "DelayedActions", "NoisyObservations", "changes", "probe", "scores"]
 
-Row = dict[str, str | float]
-
 ENVS = ["CartPoleSoftWallsHardPyBullet-v0", ACROBOT]
-EPISODES, FEW_EPISODES = 20, 4
 
 FACTORS = (0.7, 1.3)
 NOISE = (0.002, 0.005, 0.01)
@@ -151,10 +149,7 @@ def _with_plant(env_id: str, name: str, amount: float, plant: Plant) -> Change:
 
 
 def _wrapped(env_id: str, name: str, amount: float, wrapper: type[gym.Wrapper], **kwargs: Any) -> Change:
-    spec = copy.deepcopy(gym.spec(env_id))
-    made = WrapperSpec(wrapper.__name__, f"{wrapper.__module__}:{wrapper.__name__}", kwargs)
-    spec.additional_wrappers = (*spec.additional_wrappers, made)
-    return Change(name, float(amount), spec, False)
+    return Change(name, float(amount), wrapped(env_id, wrapper, **kwargs), False)
 
 
 def _state_scale(env_id: str, reset_range: np.ndarray) -> np.ndarray:
@@ -165,13 +160,13 @@ def _state_scale(env_id: str, reset_range: np.ndarray) -> np.ndarray:
     return np.asarray(tuned["policy_kwargs"].get("state_scale", reset_range), dtype=np.float64)
 
 
-def _score(controller: Controller, change: Change, n_episodes: int) -> Row:
+def _score(controller: Controller, change: Change, n_episodes: int) -> ProbeLine:
     with contextlib.closing(Evaluator(change.spec, n_episodes)) as evaluator:
         value = evaluator.score(controller)
     return {"change": change.change, "amount": change.amount, "quantity": "score", "value": value}
 
 
-def scores(controller: Controller, env_id: str, n_episodes: int = EPISODES) -> list[Row]:
+def scores(controller: Controller, env_id: str, n_episodes: int = EPISODES) -> list[ProbeLine]:
     """Score one controller under every change.
 
     :param controller: see :data:`~benchmarks.evaluation.Controller`
@@ -181,12 +176,12 @@ def scores(controller: Controller, env_id: str, n_episodes: int = EPISODES) -> l
     return [_score(controller, change, n_episodes) for change in changes(env_id)]
 
 
-def informed_scores(env_id: str, n_episodes: int = EPISODES) -> list[Row]:
+def informed_scores(env_id: str, n_episodes: int = EPISODES) -> list[ProbeLine]:
     """Score, for every change of the model, the oracle that knows of it."""
     return [_score(oracle(change.spec), change, n_episodes) for change in changes(env_id) if change.of_model]
 
 
-def probe(model: BaseAlgorithm, env_id: str, *, small: bool = False) -> list[Row]:
+def probe(model: BaseAlgorithm, env_id: str, *, small: bool = False) -> list[ProbeLine]:
     """Score a trained model under every change: keys ``change`` and ``amount``.
 
     :param model: any Stable-Baselines3 model
@@ -203,7 +198,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--episodes", type=int, default=EPISODES, help="scored episodes")
     parser.add_argument("--output", type=Path, default=Path("benchmarks/results/robustness_references.csv"))
     args = parser.parse_args(argv)
-    lines: list[Row] = []
+    lines: list[ProbeLine] = []
     for env_id in args.env:
         for name, rows in (
             ("oracle", scores(oracle(env_id), env_id, args.episodes)),

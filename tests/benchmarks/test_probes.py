@@ -3,30 +3,34 @@
 from __future__ import annotations
 
 import contextlib
+import copy
+import dataclasses
 
 import gymnasium as gym
 import numpy as np
 import pytest
 from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-import sb3_mpc_policy  # noqa: F401 - registers the policy and the environments
-from benchmarks.evaluation import RESET_SEEDS, controller_of, score
-from benchmarks.probes import robustness
+from benchmarks.evaluation import RESET_SEEDS, Evaluator, controller_of, score
+from benchmarks.probes import reuse, robustness
+from benchmarks.probes.common import wrapped
+from benchmarks.probes.reuse import TaskEnv, leaning, regulator_at_rest, tasks
 from benchmarks.probes.robustness import Change, changes
 from benchmarks.references import contact_env, lqr
 from contact_envs.dynamics import CartPoleParameters, integrate
+from sb3_mpc_policy import LinearComplementaritySystem, QuadraticReward, hyperparams
+from sb3_mpc_policy.lcs import LcsMatrices
+from sb3_mpc_policy.lqr import affine_lqr
 
 HARD = "CartPoleSoftWallsHardPyBullet-v0"
 ACROBOT = "AcrobotSoftLimitsPyBullet-v0"
+FAR = {HARD: "wall_distance", ACROBOT: "limit_angle"}
 
 
 def the_change(env_id: str, name: str, amount: float) -> Change:
     (found,) = (one for one in changes(env_id) if (one.change, one.amount) == (name, amount))
     return found
-
-
-def still(observations: np.ndarray) -> np.ndarray:
-    return np.zeros((len(observations), 1))
 
 
 def trajectory(change: Change, actions: np.ndarray, seed: int = RESET_SEEDS[0]) -> np.ndarray:
@@ -102,7 +106,8 @@ def test_a_lighter_link_of_the_acrobot_weighs_less() -> None:
 
 def test_a_delayed_zero_is_a_zero() -> None:
     delay, nothing = the_change(HARD, "delay", 1.0), the_change(HARD, "nothing", 0.0)
-    assert score(still, delay.spec, 3) == score(still, nothing.spec, 3)
+    actions = np.zeros(40)
+    np.testing.assert_array_equal(trajectory(delay, actions), trajectory(nothing, actions))
 
 
 def test_a_delayed_action_acts_one_step_later() -> None:
@@ -146,3 +151,123 @@ def test_the_table_of_references_tells_who_knows_of_the_change(tmp_path, monkeyp
 def test_other_environments_are_refused() -> None:
     with pytest.raises(TypeError, match="env_id"):
         changes("Pendulum-v1")
+
+
+# -- reuse --
+
+
+def knowing(env_id: str, model: LcsMatrices[np.ndarray] | None = None) -> PPO:
+    """The tuned policy, untrained, that starts from the true LCS, or another."""
+    settings = hyperparams(env_id)
+    arguments = settings.pop("policy_kwargs")
+    with contact_env(env_id) as env:
+        matrices = env.true_lcs() if model is None else model
+    known = LinearComplementaritySystem.from_matrices(*matrices, state_scale=arguments.pop("state_scale"))
+    return PPO(
+        "MpcLcsPolicy", gym.make(env_id), device="cpu", policy_kwargs=arguments | {"initial_lcs": known}, **settings
+    )
+
+
+def true_model(env_id: str) -> LcsMatrices[np.ndarray]:
+    with contact_env(env_id) as env:
+        return LcsMatrices(*env.true_lcs())
+
+
+def values(rows: list[dict], key: str) -> dict[str, float]:
+    return {row["task"]: row["value"] for row in rows if row["controller"] == key}
+
+
+@pytest.mark.parametrize("env_id", [HARD, ACROBOT])
+def test_leaning_is_a_steady_state_that_a_contact_carries(env_id: str) -> None:
+    with contact_env(env_id) as env:
+        state, force = leaning(env.parameters)
+        np.testing.assert_allclose(env.equations_of_motion(state, force), 0.0, atol=1e-9)
+        right, left = env.parameters.contact_forces(state)
+        assert right > 0.1 and left == 0.0
+        assert abs(force) < 0.1 * env.max_force
+        # without the contact it would fall: at rest for no force at all
+        free = dataclasses.replace(env.parameters, **{FAR[env_id]: 10.0})
+        falls = [free.equations_of_motion(state, u)[list(free.VELOCITIES)] for u in (force, force + 1.0)]
+    slope = falls[1] - falls[0]
+    assert np.abs(falls[0] - slope * (falls[0] @ slope) / (slope @ slope)).max() > 0.1
+
+
+@pytest.mark.parametrize("env_id", [HARD, ACROBOT])
+def test_the_place_to_hold_is_a_steady_state_without_contact(env_id: str) -> None:
+    hold = next(task for task in tasks(env_id) if task.name == "hold")
+    with contact_env(env_id) as env:
+        target = np.asarray(hold.reward.target)
+        assert not env.parameters.contact_forces(target).any() and target.any()
+        still, pushed = (env.equations_of_motion(target, u)[list(env.parameters.VELOCITIES)] for u in (0.0, 1.0))
+    slope = pushed - still
+    np.testing.assert_allclose(still - slope * (still @ slope) / (slope @ slope), 0.0, atol=1e-9)
+
+
+def test_a_task_pays_for_state_and_action_by_its_own_reward() -> None:
+    reward = QuadraticReward([1.0, 2.0, 3.0, 4.0], 5.0, target=[0.1, 0.0, 0.0, 0.0], constant=7.0)
+    with contextlib.closing(gym.make(wrapped(HARD, TaskEnv, reward=reward, start=None))) as env:
+        s, _ = env.reset(seed=0)
+        paid = env.step(np.array([0.5], np.float32))[1]
+    assert paid == pytest.approx(7.0 - (s - [0.1, 0, 0, 0]) ** 2 @ [1.0, 2.0, 3.0, 4.0] - 5.0 * 0.25)
+
+
+def test_the_environment_s_own_reward_as_a_task_pays_what_the_environment_pays() -> None:
+    with contact_env(HARD) as plant:
+        reward = QuadraticReward(plant.state_weights, plant.action_weight * plant.max_force**2, constant=15.0)
+    spec = wrapped(HARD, TaskEnv, reward=reward, start=None)
+    assert score(lqr(HARD), HARD, 2) == pytest.approx(_score_of(spec), rel=1e-6)
+
+
+def _score_of(spec: gym.envs.registration.EnvSpec) -> float:
+    with contextlib.closing(Evaluator(spec, 2)) as evaluator:
+        return evaluator.score(lqr(HARD))
+
+
+def test_episodes_of_leaning_start_there_and_move() -> None:
+    lean = next(task for task in tasks(HARD) if task.name == "lean")
+    with contextlib.closing(gym.make(wrapped(HARD, TaskEnv, reward=lean.reward, start=lean.start))) as env:
+        starts = np.array([env.reset(seed=seed)[0] for seed in (1, 2, 1)]) - lean.start
+    assert np.all(starts[:, [0, 2]] == 0.0) and np.all(np.abs(starts[:, [1, 3]]) <= 0.2)
+    assert (starts[0] == starts[2]).all() and (starts[0] != starts[1]).any()
+
+
+def test_the_regulator_of_least_cost_at_rest_is_that_of_the_wall_for_leaning_and_the_free_one_else() -> None:
+    model = true_model(HARD)
+    free = affine_lqr(model.A, model.B, model.d, *tasks(HARD)[0].reward.cost(4, 1)[:2])
+    found = {task.name: regulator_at_rest(model, task.reward.cost(4, 1)) for task in tasks(HARD)}
+    np.testing.assert_array_equal(found["hold"].K, free.K)
+    # closed loop with the wall shut: it comes to rest where the steady state is, by the equations of motion
+    lean = found["lean"]
+    s = np.array([0.3, 0.0, 0.08, 0.0])
+    for _ in range(3_000):
+        a = lean.K @ s + lean.k
+        lam = -(model.D[0] @ s + model.E[0] @ a + model.c[0]) / model.F[0, 0]
+        s = model.A @ s + model.B @ a + model.C[:, 0] * lam
+    with contact_env(HARD) as env:
+        np.testing.assert_allclose(s, leaning(env.parameters)[0], atol=2e-3)
+
+
+def test_the_true_model_scores_what_the_oracle_does_and_leaves_the_policy_as_it_is() -> None:
+    model = knowing(HARD)
+    before = copy.deepcopy(model.policy.state_dict())
+    rows = reuse.probe(model, HARD, small=True)
+    assert values(rows, "learned") == pytest.approx(values(rows, "oracle"), rel=1e-6)
+    assert set(values(rows, "lqr")) == {"hold", "lean", "cost"}
+    # LQR, which knows of no wall, stands up beside it: 0.1 rad at the weight of 400 costs 4 of 15 a step
+    assert values(rows, "oracle")["lean"] > 5_900 > 5_000 > values(rows, "lqr")["lean"]
+    for name, value in model.policy.state_dict().items():
+        assert value is before[name] or (value == before[name]).all(), name
+
+
+def test_a_model_without_contacts_cannot_lean() -> None:
+    true = true_model(HARD)
+    rows = reuse.probe(knowing(HARD, true._replace(C=0.0 * true.C)), HARD, small=True)
+    assert values(rows, "learned")["lean"] < 5_000
+
+
+def test_reuse_is_for_learned_models_in_the_environment_s_units() -> None:
+    with pytest.raises(TypeError, match="MpcLcsPolicy"):
+        reuse.probe(PPO("MlpPolicy", gym.make(HARD), device="cpu"), HARD, small=True)
+    env = VecNormalize(DummyVecEnv([lambda: gym.make(HARD)]))
+    with pytest.raises(ValueError, match="normalised"):
+        reuse.probe(PPO("MpcLcsPolicy", env, device="cpu"), HARD, small=True)
