@@ -25,7 +25,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from benchmarks import experiments, training
+from benchmarks import execution, experiments, training
 from benchmarks.execution import Executor, Failure, Outcome, Task
 from benchmarks.experiments import Experiment
 from benchmarks.progress import Costs, ProgressBar
@@ -142,7 +142,7 @@ class Benchmark:
             return
         executor = self.executor
         with (
-            ProgressBar(self.console, title, expected, executor.under_way, executor.jobs) as bar,
+            ProgressBar(self.console, title, expected, executor.under_way, executor.backend.jobs) as bar,
             contextlib.closing(executor.outcomes(tasks)) as outcomes,
         ):
             for outcome in outcomes:
@@ -240,7 +240,9 @@ def arguments(argv: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--table", type=Path, default=experiments.TABLE, metavar="FILE")
     parser.add_argument("--only", nargs="+", metavar="PATTERN", help='rows, e.g. "mpc/*"; without it, all')
     parser.add_argument("--seeds", nargs="+", type=int, metavar="N", help="in place of those of the table")
-    parser.add_argument("--jobs", type=int, default=1, help="runs at a time, one thread each")
+    parser.add_argument("--jobs", type=int, help="runs at a time, one thread each; 1, or all cores of a Ray cluster")
+    parser.add_argument("--executor", choices=["loky", "ray"], default="loky", help="processes here, or a Ray cluster")
+    parser.add_argument("--address", help="of the Ray cluster; without it, one is started on this machine")
     parser.add_argument("--results", type=Path, help=f"folder of the result files, {RESULTS} without it")
     parser.add_argument("--scratch", type=Path, default=SCRATCH, help="folder of trained models and of failures")
     parser.add_argument("--small", action="store_true", help="one short run of each row, into the scratch folder")
@@ -252,8 +254,10 @@ def arguments(argv: Sequence[str] | None = None) -> argparse.Namespace:
     args = parser.parse_args(argv)
     if args.set and args.results is None and not args.small:
         parser.error("--set changes what the results mean: name another folder for them with --results")
-    if args.jobs < 1:
+    if args.jobs is not None and args.jobs < 1:
         parser.error(f"--jobs must be at least 1, got {args.jobs}")
+    if args.address is not None and args.executor != "ray":
+        parser.error("--address is for --executor ray")
     if args.small:
         args.scratch /= "small"
         args.results = args.results or args.scratch
@@ -300,10 +304,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     console = Console()
     try:
         table = chosen(args)
-    except (OSError, ValueError) as error:
+        backend = (
+            execution.loky(args.jobs or 1)
+            if args.list or args.executor == "loky"
+            else execution.ray(args.address, args.jobs)
+        )
+    except (OSError, ValueError, ImportError) as error:
         print(f"error: {error}", file=sys.stderr)
         return BAD_ARGUMENTS
-    executor = Executor(args.jobs, lambda text: console.print(text, markup=False, soft_wrap=True))
+    executor = Executor(backend, lambda text: console.print(text, markup=False, soft_wrap=True))
     benchmark = Benchmark(Store(args.results), args.scratch, executor, console, args.small)
     missing = benchmark.missing_of(table)
     todo = [m for of_row in missing.values() for m in of_row]
