@@ -6,13 +6,15 @@ import copy
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 from gymnasium.envs.registration import EnvSpec, WrapperSpec
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_mpc_policy import MpcLcsPolicy
+from benchmarks.references import contact_env
+from sb3_mpc_policy import MpcLcsPolicy, hyperparams
 
-__all__ = ["EPISODES", "FEW_EPISODES", "learned_policy", "wrapped"]
+__all__ = ["EPISODES", "FEW_EPISODES", "learned_policy", "state_scale", "wrapped"]
 
 EPISODES, FEW_EPISODES = 20, 4
 
@@ -28,6 +30,21 @@ def wrapped(env_id: str, wrapper: type[gym.Wrapper], **kwargs: Any) -> EnvSpec:
     made = WrapperSpec(wrapper.__name__, f"{wrapper.__module__}:{wrapper.__name__}", kwargs)
     spec.additional_wrappers = (*spec.additional_wrappers, made)
     return spec
+
+
+def state_scale(env_id: str) -> np.ndarray:
+    """(n_x,) the size of each state: that of the tuned settings where there are any, else the reset range.
+
+    :param env_id: an environment of ``contact_envs``
+    :raises TypeError: it is another
+    """
+    with contact_env(env_id) as env:
+        reset_range = env.reset_range
+    try:
+        tuned = hyperparams(env_id)["policy_kwargs"]
+    except KeyError:
+        return reset_range
+    return np.asarray(tuned.get("state_scale", reset_range), dtype=np.float64)
 
 
 def learned_policy(model: BaseAlgorithm) -> MpcLcsPolicy:

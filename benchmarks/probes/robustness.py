@@ -6,8 +6,8 @@ The controller is used as it is; it is told of nothing, and learns nothing. One 
 
 * masses and lengths, 0.7 and 1.3 times what they were; the distance of a link's mass centre changes with its length;
 * the contacts' stiffness, about a third and about three times what it was (N/m, N m/rad);
-* Gaussian noise on every observation, its standard deviation a share of the state scale: the tuned one where there is
-  one, else the reset range. The reward is still that of the true state;
+* Gaussian noise on every observation, its standard deviation a share of the state scale (of the tuned settings, else
+  the reset range). The reward is still that of the true state;
 * a delay: an action acts so many control steps later than it is chosen, the first of an episode after none at all.
 
 The command measures controllers that know the model: the oracle and LQR, which know the one before the change, and the
@@ -33,14 +33,13 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from benchmarks.contact_matters import ACROBOT, changed
 from benchmarks.evaluation import Controller, Evaluator, controller_of
 from benchmarks.probes import ProbeLine
-from benchmarks.probes.common import EPISODES, FEW_EPISODES, wrapped
+from benchmarks.probes.common import EPISODES, FEW_EPISODES, state_scale, wrapped
 from benchmarks.references import contact_env, lqr, oracle
 from contact_envs.plants import AcrobotParameters, CartPoleParameters, Plant
-from sb3_mpc_policy import hyperparams
 
 __all__ = ["Change", "DelayedActions", "NoisyObservations", "changes", "probe", "scores"]
 
-ENVS = ["CartPoleSoftWallsHardPyBullet-v0", ACROBOT]
+ENVS = ["CartPoleSoftWallsPyBullet-v0", "CartPoleSoftWallsHardPyBullet-v0", ACROBOT]
 
 FACTORS = (0.7, 1.3)
 NOISE = (0.002, 0.005, 0.01)
@@ -127,7 +126,7 @@ def changes(env_id: str) -> list[Change]:
     :raises TypeError: another environment
     """
     with contact_env(env_id) as env:
-        plant, reset_range = env.parameters, env.reset_range
+        plant = env.parameters
     result = [Change("nothing", 0.0, changed(env_id, {}), False)]
     for name, fields in FACTORS_OF[type(plant)].items():
         for factor in FACTORS:
@@ -136,7 +135,7 @@ def changes(env_id: str) -> list[Change]:
     name, field, values = STIFFNESS_OF[type(plant)]
     for value in values:
         result.append(_with_plant(env_id, name, value, dataclasses.replace(plant, **{field: value})))
-    scale = _state_scale(env_id, reset_range)
+    scale = state_scale(env_id)
     for share in NOISE:
         result.append(_wrapped(env_id, "noise", share, NoisyObservations, deviation=share * scale))
     for steps in DELAY:
@@ -150,14 +149,6 @@ def _with_plant(env_id: str, name: str, amount: float, plant: Plant) -> Change:
 
 def _wrapped(env_id: str, name: str, amount: float, wrapper: type[gym.Wrapper], **kwargs: Any) -> Change:
     return Change(name, float(amount), wrapped(env_id, wrapper, **kwargs), False)
-
-
-def _state_scale(env_id: str, reset_range: np.ndarray) -> np.ndarray:
-    try:
-        tuned = hyperparams(env_id)
-    except KeyError:
-        return reset_range
-    return np.asarray(tuned["policy_kwargs"].get("state_scale", reset_range), dtype=np.float64)
 
 
 def _score(controller: Controller, change: Change, n_episodes: int) -> ProbeLine:

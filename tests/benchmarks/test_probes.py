@@ -13,8 +13,10 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from benchmarks.evaluation import RESET_SEEDS, Evaluator, controller_of, score
-from benchmarks.probes import reuse, robustness
+from benchmarks.learned_contacts import ContactTransitions
+from benchmarks.probes import model_quality, reuse, robustness
 from benchmarks.probes.common import wrapped
+from benchmarks.probes.model_quality import Windows, matrix_lines, windows
 from benchmarks.probes.reuse import TaskEnv, leaning, regulator_at_rest, tasks
 from benchmarks.probes.robustness import Change, changes
 from benchmarks.references import contact_env, lqr
@@ -271,3 +273,119 @@ def test_reuse_is_for_learned_models_in_the_environment_s_units() -> None:
     env = VecNormalize(DummyVecEnv([lambda: gym.make(HARD)]))
     with pytest.raises(ValueError, match="normalised"):
         reuse.probe(PPO("MpcLcsPolicy", env, device="cpu"), HARD, small=True)
+
+
+# -- model quality --
+
+SCALE, ACTION_SCALE = np.array([0.35, 1.0, 0.3, 1.0]), np.ones(1)
+
+
+def matrix_errors(learned: LcsMatrices[np.ndarray], env_id: str = HARD) -> dict[tuple[str, str], float]:
+    """(matrix, contact) -> error, and ("spurious", "") -> number."""
+    lines = matrix_lines(learned, true_model(env_id), SCALE, ACTION_SCALE)
+    return {(line.get("matrix", "spurious"), line.get("contact", "")): line["value"] for line in lines}
+
+
+def renamed(model: LcsMatrices[np.ndarray], order: list[int], force: np.ndarray, gap: np.ndarray) -> LcsMatrices:
+    """The same system with contacts in another order, and other units of their forces and gaps."""
+    A, B, C, d, D, E, F, c = model
+    C, D, E, F, c = C[:, order] * force, D[order], E[order], F[order][:, order], c[order]
+    return LcsMatrices(A, B, C, d, D / gap[:, None], E / gap[:, None], F * force / gap[:, None], c / gap)
+
+
+@pytest.mark.parametrize("env_id", [HARD, ACROBOT])
+def test_the_true_model_has_no_error_in_its_matrices_and_that_of_the_true_one_in_its_predictions(env_id: str) -> None:
+    rows = model_quality.probe(knowing(env_id), env_id, small=True)
+    matrices = [row for row in rows if "matrix" in row]
+    assert len(matrices) == 3 + 2 * 4
+    assert max(row["value"] for row in matrices) < 1e-6
+    assert [row["value"] for row in rows if row["quantity"] == "spurious contacts"] == [0.0]
+    predictions = [[row["value"] for row in rows if row["model"] == name and "motion" in row]
+                   for name in ("learned", "true")]  # fmt: skip
+    assert len(predictions[0]) == 4
+    np.testing.assert_allclose(*predictions, rtol=1e-6)
+
+
+def test_order_and_units_of_contacts_do_not_matter() -> None:
+    true = true_model(HARD)
+    rng = np.random.default_rng(0)
+    off = LcsMatrices(*(part * rng.uniform(0.9, 1.1, part.shape) for part in true))
+    other = renamed(off, [1, 0], np.array([30.0, 0.2]), np.array([0.01, 3.0]))
+    errors, of_other = matrix_errors(off), matrix_errors(other)
+    assert min(errors[matrix, contact] for matrix in ("D", "effect") for contact in ("0", "1")) > 0.005
+    assert of_other == pytest.approx(errors)
+    s, a = rng.uniform(-SCALE, SCALE, (50, 4)), rng.uniform(-1.0, 1.0, (50, 1))
+    moved = [reference_step(model, s, a) for model in (off, other)]
+    np.testing.assert_allclose(*moved, atol=1e-9)
+
+
+def reference_step(model: LcsMatrices[np.ndarray], s: np.ndarray, a: np.ndarray) -> np.ndarray:
+    """Eq (5) by trying every set of closed contacts."""
+    A, B, C, d, D, E, F, c = model
+    result = s @ A.T + a @ B.T + d
+    for i, q in enumerate(s @ D.T + a @ E.T + c):
+        for closed in ([], [0], [1], [0, 1]):
+            lam = np.zeros(2)
+            lam[closed] = -np.linalg.solve(F[np.ix_(closed, closed)], q[closed])
+            if (lam >= 0).all() and (q + F @ lam >= -1e-9 * np.abs(q)).all():
+                result[i] += C @ lam
+                break
+        else:
+            raise AssertionError("no solution")
+    return result
+
+
+def test_a_model_that_stands_still_has_an_error_of_one() -> None:
+    true = true_model(HARD)
+    errors = matrix_errors(true._replace(A=np.eye(4), B=0.0 * true.B, C=0.0 * true.C, d=true.B[:, 0]))
+    assert {key: errors[key] for key in (("A", ""), ("B", ""), ("d", ""))} == pytest.approx(
+        {("A", ""): 1.0, ("B", ""): 1.0, ("d", ""): 1.0}
+    )
+    assert (errors["effect", "0"], errors["effect", "1"], errors["spurious", ""]) == (1.0, 1.0, 0.0)
+    assert ("D", "0") not in errors
+
+
+def test_what_is_wrong_with_a_contact_shows_where_it_is_wrong() -> None:
+    true = true_model(HARD)
+    softer = matrix_errors(true._replace(C=true.C * [0.5, 1.0]))
+    assert softer == pytest.approx({key: 0.5 if key == ("effect", "0") else 0.0 for key in softer}, abs=1e-9)
+    moved = matrix_errors(true._replace(c=true.c * [1.0, 1.1]))
+    assert moved == pytest.approx({key: 0.1 if key == ("c", "1") else 0.0 for key in moved}, abs=1e-9)
+
+
+def test_a_lost_contact_and_one_too_many_are_told_apart() -> None:
+    true = true_model(HARD)
+    errors = matrix_errors(true._replace(C=true.C * [0.0, 1.0]))
+    assert (errors["effect", "0"], errors["effect", "1"]) == pytest.approx((1.0, 0.0), abs=1e-9)
+    assert errors["spurious", ""] == 0.0
+    extra = LcsMatrices(
+        true.A, true.B, np.hstack([true.C, true.C[:, :1]]), true.d, np.vstack([true.D, [[0.0, 0.0, 1.0, 0.0]]]),
+        np.vstack([true.E, [[0.0]]]), np.diag([*np.diag(true.F), 1.0]), np.append(true.c, 0.1),
+    )  # fmt: skip
+    assert matrix_errors(extra)["spurious", ""] == 1.0
+    assert matrix_errors(extra)["effect", "0"] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_several_steps_of_free_motion_are_powers_of_the_matrix() -> None:
+    true = true_model(HARD)
+    rng = np.random.default_rng(0)
+    s = 0.1 * rng.uniform(-SCALE, SCALE, (30, 4))
+    test = Windows(s, np.zeros((30, 10, 1)), s @ np.linalg.matrix_power(true.A, 10).T)
+    assert test.error(LinearComplementaritySystem.from_matrices(*true)) == pytest.approx(0.0, abs=1e-9)
+    still = true._replace(A=np.eye(4))
+    by_hand = np.sqrt(np.mean(((test.s_end - s) / (test.s_end - s).std(axis=0)) ** 2))
+    assert test.error(LinearComplementaritySystem.from_matrices(*still)) == pytest.approx(by_hand)
+
+
+def test_one_step_in_contact_is_measured_as_in_the_benchmark_of_learned_contacts() -> None:
+    true = LinearComplementaritySystem.from_matrices(*true_model(HARD))
+    assert windows(HARD)["contact", 1].error(true) == pytest.approx(ContactTransitions(HARD).error(true))
+
+
+def test_contact_is_needed_in_contact_and_only_there() -> None:
+    true = true_model(HARD)
+    blind = LinearComplementaritySystem.from_matrices(*true._replace(C=0.0 * true.C))
+    knows = LinearComplementaritySystem.from_matrices(*true)
+    for (motion, _), test in windows(HARD, few=True).items():
+        ratio = test.error(knows) / test.error(blind)
+        assert ratio < 0.5 if motion == "contact" else ratio == pytest.approx(1.0, rel=0.2)
