@@ -127,8 +127,10 @@ def test_noise_is_of_the_size_it_says_and_leaves_the_motion_alone() -> None:
     np.testing.assert_allclose(noise[1].std(axis=0), 0.01 * np.array([0.35, 1.0, 0.3, 1.0]), rtol=0.4)
     again = trajectory(the_change(HARD, "noise", 0.01), actions) - quiet
     np.testing.assert_array_equal(again, noise[1])
-    other = trajectory(the_change(HARD, "noise", 0.01), actions, seed=5)
-    assert not np.allclose(other[0] - quiet[0], noise[1][0])
+    other = [
+        trajectory(the_change(HARD, *change), actions[:1], seed=5) for change in (("nothing", 0.0), ("noise", 0.01))
+    ]
+    assert not np.allclose(other[1] - other[0], noise[1][:2])
 
 
 def test_what_is_scored_is_the_model_s_deterministic_policy() -> None:
