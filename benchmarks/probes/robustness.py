@@ -157,14 +157,18 @@ def _score(controller: Controller, change: Change, n_episodes: int) -> ProbeLine
     return {"change": change.change, "amount": change.amount, "quantity": "score", "value": value}
 
 
-def scores(controller: Controller, env_id: str, n_episodes: int = EPISODES) -> list[ProbeLine]:
+def scores(controller: Controller, env_id: str, n_episodes: int = EPISODES, small: bool = False) -> list[ProbeLine]:
     """Score one controller under every change.
 
     :param controller: see :data:`~benchmarks.evaluation.Controller`
     :param env_id: see :func:`changes`
     :param n_episodes: see :class:`~benchmarks.evaluation.Evaluator`
+    :param small: only the last amount of each change
     """
-    return [_score(controller, change, n_episodes) for change in changes(env_id)]
+    tried = changes(env_id)
+    if small:
+        tried = list({change.change: change for change in tried}.values())
+    return [_score(controller, change, n_episodes) for change in tried]
 
 
 def informed_scores(env_id: str, n_episodes: int = EPISODES) -> list[ProbeLine]:
@@ -177,9 +181,9 @@ def probe(model: BaseAlgorithm, env_id: str, *, small: bool = False) -> list[Pro
 
     :param model: any Stable-Baselines3 model
     :param env_id: the environment it was trained in
-    :param small: fewer episodes
+    :param small: fewer episodes, and one amount of each change
     """
-    return scores(controller_of(model), env_id, FEW_EPISODES if small else EPISODES)
+    return scores(controller_of(model), env_id, FEW_EPISODES if small else EPISODES, small)
 
 
 def main(argv: Sequence[str] | None = None) -> None:

@@ -138,8 +138,15 @@ def test_what_is_scored_is_the_model_s_deterministic_policy() -> None:
     rows = robustness.probe(model, HARD, small=True)
     assert rows[0] == {"change": "nothing", "amount": 0.0, "quantity": "score",
                        "value": score(controller_of(model), HARD, 4)}  # fmt: skip
-    assert len({(row["change"], row["amount"]) for row in rows}) == len(rows) == 11
-    assert len({row["value"] for row in rows}) > 5
+    assert [row["change"] for row in rows] == [
+        "nothing",
+        "pole mass",
+        "pole length",
+        "wall stiffness",
+        "noise",
+        "delay",
+    ]
+    assert len({row["value"] for row in rows}) >= 5  # the walls may be out of its reach
 
 
 def test_the_table_of_references_tells_who_knows_of_the_change(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
