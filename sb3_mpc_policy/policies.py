@@ -78,6 +78,7 @@ class MpcLcsPolicy(ActorCriticPolicy):
     :param prediction_loss: "prediction" (eq 12) or "violation" (Jin et al. 2022)
     :param model_fit: what is fitted directly between rollouts: "contacts" for the whole model, "least_squares" for A, B
         and d only, or "gradient" for nothing, eq (16) alone
+    :param fit_updates: number of updates after which the model is left to the gradient; None for never
     :param policy_gradient: whether the gradient of PPO's own loss reaches the model, as in eq (16)
     :param replay: True to learn from all transitions so far, False from the current rollout alone (the paper's D_k)
     :param state_scale: (n_x,) size of each state where the controller works; the spread of the first rollout where
@@ -114,6 +115,7 @@ class MpcLcsPolicy(ActorCriticPolicy):
         preset: str = "default",
         prediction_loss: str | None = None,
         model_fit: str | None = None,
+        fit_updates: int | None = None,
         policy_gradient: bool = True,
         replay: bool | None = None,
         state_scale: ArrayLike | None = None,
@@ -132,6 +134,8 @@ class MpcLcsPolicy(ActorCriticPolicy):
             )
         if not (np.isfinite(prediction_coef) and prediction_coef >= 0):
             raise ValueError(f"prediction_coef must be a finite number >= 0, got {prediction_coef!r}")
+        if fit_updates is not None and (int(fit_updates) != fit_updates or fit_updates < 0):
+            raise ValueError(f"fit_updates must be an integer >= 0 or None, got {fit_updates!r}")
         if preset not in PRESETS:
             raise ValueError(f"preset must be one of {sorted(PRESETS)}, got {preset!r}")
         prediction_loss = PRESETS[preset]["prediction_loss"] if prediction_loss is None else prediction_loss
@@ -157,9 +161,9 @@ class MpcLcsPolicy(ActorCriticPolicy):
         self._mpc_arguments: dict[str, Any] = dict(
             horizon=horizon, n_contacts=n_contacts, reward=reward, terminal_value=terminal_value, penalty=penalty,
             smoothing=smoothing, n_iterations=n_iterations, solver=solver, check=check, prediction_coef=prediction_coef,
-            preset=preset, prediction_loss=prediction_loss, model_fit=model_fit, policy_gradient=policy_gradient,
-            replay=replay, state_scale=state_scale, action_scale=action_scale, initial_lcs=initial_lcs,
-            log_std_init=log_std_init, target_noise=target_noise,
+            preset=preset, prediction_loss=prediction_loss, model_fit=model_fit, fit_updates=fit_updates,
+            policy_gradient=policy_gradient, replay=replay, state_scale=state_scale, action_scale=action_scale,
+            initial_lcs=initial_lcs, log_std_init=log_std_init, target_noise=target_noise,
         )  # fmt: skip
         self._sizes = n_states, n_actions
         super().__init__(
@@ -175,6 +179,7 @@ class MpcLcsPolicy(ActorCriticPolicy):
         )
 
     _scale_is_set: torch.Tensor
+    _fits: torch.Tensor
     value_net: nn.Module  # type: ignore[assignment]  # linear, or a QuadraticCritic
 
     # -- construction -------------------------------------------------------------------------------------------
@@ -192,6 +197,7 @@ class MpcLcsPolicy(ActorCriticPolicy):
         )  # fmt: skip
         scale_is_known = given["state_scale"] is not None or given["initial_lcs"] is not None
         self.register_buffer("_scale_is_set", torch.tensor(scale_is_known))
+        self.register_buffer("_fits", torch.tensor(0))
         if self.mpc.terminal_value.needs_quadratic_critic:
             self.value_net = QuadraticCritic(lcs.state_scale)
         if given["log_std_init"] is None:
@@ -385,10 +391,12 @@ class MpcLcsPolicy(ActorCriticPolicy):
                 cost, log["train/reward_loss"] = fit_cost(data.s, data.a, data.reward, *scales)
                 self.mpc.set_cost(cost)
             target, prior = self.mpc.target(), self._mpc_arguments["initial_lcs"]
-            if self._mpc_arguments["model_fit"] == "contacts" and self.lcs.n_contacts:
+            model_fit = self._model_fit()
+            if model_fit == "contacts" and self.lcs.n_contacts:
                 log["train/n_contacts"] = fit_contacts(self.lcs, data, target, prior)
-            if self._mpc_arguments["model_fit"] != "gradient":
+            if model_fit != "gradient":
                 log["train/model_fit_error"] = fit_tangent(self.lcs, data, target, prior)
+                self._fits += 1
             self._target.move(self.lcs)
         if self._mpc_arguments["preset"] != "paper":
             self._limit_noise()
@@ -398,6 +406,11 @@ class MpcLcsPolicy(ActorCriticPolicy):
         critic = self.value_net if isinstance(self.value_net, QuadraticCritic) else None
         self.mpc.refresh(critic, reward_scale)
         return log | self._controller_log()
+
+    def _model_fit(self) -> str:
+        """What the coming fit is of."""
+        most = self._mpc_arguments["fit_updates"]
+        return "gradient" if most is not None and self._fits >= most else str(self._mpc_arguments["model_fit"])
 
     def end_training(self) -> None:
         """Training ended: nothing explores any more."""

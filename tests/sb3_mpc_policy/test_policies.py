@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import copy
+import itertools
 import warnings
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -298,6 +300,38 @@ def test_a_coefficient_of_zero_leaves_the_model_to_ppo_alone() -> None:
     assert all(torch.equal(value, before[name]) for name, value in model.policy.lcs.named_parameters())
 
 
+class Models(BaseCallback):
+    """The model as each rollout begins."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.seen: list[dict[str, torch.Tensor]] = []
+
+    def _on_rollout_start(self) -> None:
+        lcs = policy_of(self.model).lcs
+        self.seen.append({name: value.detach().clone() for name, value in lcs.named_parameters()})
+
+    def _on_step(self) -> bool:
+        return True
+
+
+@pytest.mark.parametrize("fit_updates", [0, 2])
+def test_after_so_many_updates_the_model_is_fitted_no_more(fit_updates: int) -> None:
+    models = Models()
+    nothing_else = dict(prediction_coef=0.0, policy_gradient=False)
+    small_ppo(several(1), fit_updates=fit_updates, **nothing_else).learn(5 * 32, models)
+    same = [all(torch.equal(one[name], two[name]) for name in one) for one, two in itertools.pairwise(models.seen)]
+    assert same == [number >= fit_updates for number in range(4)]
+
+
+def test_the_fits_made_before_saving_count_after_loading(tmp_path: Path) -> None:
+    nothing_else = dict(prediction_coef=0.0, policy_gradient=False)
+    small_ppo(several(1), fit_updates=2, **nothing_else).learn(2 * 32).save(tmp_path / "model")
+    models = Models()
+    PPO.load(tmp_path / "model", several(1)).learn(3 * 32, models)
+    assert all(torch.equal(value, models.seen[-1][name]) for name, value in models.seen[0].items())
+
+
 @pytest.mark.parametrize("model_fit", sorted(MODEL_FITS))
 def test_training_makes_predictions_better(model_fit: str) -> None:
     env = several(1, limit=0.4)
@@ -561,6 +595,7 @@ REFUSED: dict[str, tuple[dict[str, Any], type[Exception], str]] = {
     "n_iterations": (dict(n_iterations=0), ValueError, r"n_iterations must be an integer >= 1, got 0"),
     "penalty": (dict(penalty=0.0), ValueError, r"penalty must be a finite number > 0, got 0.0"),
     "smoothing": (dict(smoothing=-1.0), ValueError, r"smoothing must be a finite number >= 0, got -1.0"),
+    "fits": (dict(fit_updates=-1), ValueError, r"fit_updates must be an integer >= 0 or None, got -1"),
     "coefficient": (dict(prediction_coef=-1.0), ValueError, r"prediction_coef must be a finite number >= 0, got -1"),
     "nan coefficient": (dict(prediction_coef=np.nan), ValueError, r"prediction_coef must be a finite .*got nan"),
     "solver": (

@@ -27,7 +27,7 @@ ARGUMENTS: dict[str, dict[str, Any]] = {
         net_arch=dict(pi=[], vf=[7, 5]), activation_fn=torch.nn.ReLU, ortho_init=False, log_std_init=-1.1, horizon=4,
         n_contacts=3, reward=QuadraticReward([1.0, 2.0], 0.3, target=[0.1, 0.0], constant=2.0), terminal_value="none",
         penalty=50.0, smoothing=1e-3, n_iterations=3, solver="daqp", check=True, prediction_coef=7.0,
-        prediction_loss="violation", model_fit="gradient", policy_gradient=False, replay=False,
+        prediction_loss="violation", model_fit="gradient", fit_updates=3, policy_gradient=False, replay=False,
         state_scale=[0.4, 0.9], action_scale=[0.3], normalize_images=False,
         share_features_extractor=False, optimizer_class=torch.optim.SGD, optimizer_kwargs=dict(momentum=0.5),
         features_extractor_kwargs={}, target_noise=0.7,
