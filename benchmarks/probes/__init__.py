@@ -18,6 +18,7 @@ PROBES = {
     "robustness": "benchmarks.probes.robustness:probe",
     "reuse": "benchmarks.probes.reuse:probe",
     "model_quality": "benchmarks.probes.model_quality:probe",
+    "episode": "benchmarks.probes.episode:probe",
 }
 """Name -> module and function. Imported when asked for: some need what others do not."""
 

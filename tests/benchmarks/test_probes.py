@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from benchmarks.evaluation import RESET_SEEDS, Evaluator, controller_of, score
 from benchmarks.learned_contacts import ContactTransitions
-from benchmarks.probes import model_quality, reuse, robustness
+from benchmarks.probes import episode, model_quality, reuse, robustness
 from benchmarks.probes.common import wrapped
 from benchmarks.probes.model_quality import Windows, matrix_lines, windows
 from benchmarks.probes.reuse import TaskEnv, leaning, regulator_at_rest, tasks
@@ -398,3 +398,18 @@ def test_contact_is_needed_in_contact_and_only_there() -> None:
     for (motion, _), test in windows(HARD, few=True).items():
         ratio = test.error(knows) / test.error(blind)
         assert ratio < 0.5 if motion == "contact" else ratio == pytest.approx(1.0, rel=0.2)
+
+
+# -- episode -----------------------------------------------------------------------------------------------------------
+
+
+def test_the_episode_told_is_the_one_that_is_scored() -> None:
+    told = {(line["step"], line["quantity"]): line["value"] for line in episode.lines(lqr(HARD), HARD)}
+    with contextlib.closing(Evaluator(HARD)) as evaluator:
+        expected = evaluator.returns(lqr(HARD))[episode.EPISODE]
+    last = max(step for step, _ in told)
+    assert told[last, "return"] == pytest.approx(expected, abs=0.01)
+    with contextlib.closing(gym.make(HARD)) as env:
+        start, _ = env.reset(seed=RESET_SEEDS[episode.EPISODE])
+    assert [told[0, f"state {i}"] for i in range(4)] == pytest.approx(start, abs=1e-4)
+    assert len(episode.lines(lqr(HARD), HARD, most=20)) == 10 * 7
