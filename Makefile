@@ -5,7 +5,7 @@ PYTHON ?= $(shell for p in python3.11 python3 python3.12 python3.13; do \
 	"$$p" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo "$$p" && break; done)
 VENV := .venv
 BIN := $(VENV)/bin
-EXTRAS := drake,pybullet,dev
+EXTRAS := drake,pybullet,dev,ray
 # Two processes of one thread each: what the tests measure does not depend on their order, and the numerical
 # libraries' own threads only get in each other's way on problems this small.
 WORKERS ?= 2
@@ -13,7 +13,7 @@ PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS)
 SOURCES := sb3_mpc_policy envs benchmarks tests
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-slow check format benchmark benchmark-solvers benchmark-contacts docs clean
+.PHONY: help setup demo test test-slow check format benchmark benchmark-full benchmark-solvers benchmark-contacts results docs clean
 
 help: ## list the targets
 	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1\t\2/' | expand -t 20
@@ -50,10 +50,18 @@ format: setup ## rewrite the sources as `check` wants them
 	$(BIN)/ruff format $(SOURCES)
 	$(BIN)/ruff check --fix $(SOURCES)
 
-benchmark: setup ## the learning benchmark, the engines' errors, what contact is worth, into benchmarks/results/
-	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.learn --jobs $(WORKERS)
+benchmark: setup ## a small version of every experiment, in some minutes, into build/benchmark/small/
+	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.run --small --jobs $(WORKERS)
+
+benchmark-full: setup ## every experiment of docs/results.md (hours; goes on where it was stopped), then the page
+	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.run --jobs $(WORKERS)
+	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.probes.robustness
 	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.physics
 	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.contact_matters
+	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.results_page
+
+results: setup ## docs/results.md and its figures, from the committed result files alone
+	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.results_page
 
 benchmark-solvers: setup ## the solvers' speed and accuracy and the relaxation's quality, into benchmarks/results/
 	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.solver_speed
