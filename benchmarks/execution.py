@@ -65,7 +65,7 @@ def loky(jobs: int) -> Backend:
     """
     if jobs < 1:
         raise ValueError(f"jobs must be at least 1, got {jobs!r}")
-    return Backend("loky", {"inner_max_num_threads": 1, "initializer": functools.partial(_end_with, os.getpid())}, jobs)
+    return Backend("loky", {"inner_max_num_threads": 1, "initializer": _watcher(os.getpid())}, jobs)
 
 
 def ray(address: str | None = None, jobs: int | None = None) -> Backend:
@@ -204,6 +204,11 @@ def _attempt(task: Task) -> tuple[str, Any]:
 def _line(error: BaseException) -> str:
     """An exception in one line."""
     return " ".join(f"{type(error).__name__}: {error}".split())
+
+
+@functools.cache  # one and the same, or else loky starts new workers for each call
+def _watcher(parent: int) -> Callable[[], None]:
+    return functools.partial(_end_with, parent)
 
 
 def _end_with(parent: int) -> None:

@@ -239,7 +239,7 @@ def _count(value: Any) -> int:
 
 
 def _algorithm(value: Any) -> str:
-    if value not in ALGORITHMS:
+    if value not in list(ALGORITHMS):
         raise ValueError(f"must be one of {', '.join(ALGORITHMS)}, got {value!r}")
     return value
 
@@ -285,7 +285,7 @@ def _episodes(value: Any) -> int:
 
 
 def _probes(value: Any) -> tuple[str, ...]:
-    if not isinstance(value, list) or any(name not in PROBES for name in value):
+    if not isinstance(value, list) or any(name not in list(PROBES) for name in value):
         raise ValueError(f"must be a list of {', '.join(PROBES)}, got {value!r}")
     return tuple(dict.fromkeys(value))
 

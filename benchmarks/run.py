@@ -281,17 +281,17 @@ def chosen(args: argparse.Namespace) -> list[Experiment]:
 def listing(table: Sequence[Experiment], missing: Mapping[str, Sequence[Missing]]) -> Table:
     """The rows, and how much of them is there."""
     shown = Table(box=SIMPLE_HEAD)
-    for name, justify in (("row", "left"), ("environment", "left"), ("steps", "right"), ("done", "right"),
-                          ("missing", "right"), ("probes missing", "right")):  # fmt: skip
-        shown.add_column(name, justify=justify, no_wrap=True)  # type: ignore[arg-type]
+    shown.add_column("row", no_wrap=True)
+    for name in ("steps", "done", "missing", "probes missing"):
+        shown.add_column(name, justify="right")
     for row in table:
         left = missing.get(row.name)
         if left is None:
-            shown.add_row(row.name, row.env, f"{row.steps:,}", "?", "?", "?", style="red")
+            shown.add_row(row.name, f"{row.steps:,}", "?", "?", "?", style="red")
             continue
         untrained = sum(m.model is None for m in left)
         numbers = (len(row.seeds) - untrained, untrained, len(left) - untrained)
-        shown.add_row(row.name, row.env, f"{row.steps:,}", *(str(n) if n else "-" for n in numbers))
+        shown.add_row(row.name, f"{row.steps:,}", *(str(n) if n else "-" for n in numbers))
     return shown
 
 

@@ -151,12 +151,13 @@ class Store:
         others = [each for each in self.runs(row).values() if each.seed != run.seed]
         path, marker = self._path(row), self._path(row, ".runs")
         lines = [line for line in _read(path, EvaluationLine) if line.seed != run.seed]
+        probed = {probe: self.probe(row, probe) for probe in PROBES}
         if marker.exists():
             _write(marker, FinishedRun, others)
-        for probe in PROBES:
-            if (file := self._path(row, f".{probe}")).exists():
-                kept = [line for line in self.probe(row, probe) if line["seed"] != run.seed]
-                _write_table(file, _columns(kept), kept)
+        for probe, found in probed.items():
+            if found:
+                kept = [line for line in found if line["seed"] != run.seed]
+                _write_table(self._path(row, f".{probe}"), _columns(kept), kept)
         lines += [
             EvaluationLine(run.seed, *e._replace(seconds=round(e.seconds, 2), score=round(e.score, 3)))
             for e in evaluations

@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from stable_baselines3 import PPO
+from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import sb3_mpc_policy  # noqa: F401 - registers the policy and the environments
@@ -212,6 +212,47 @@ def test_evaluations_stand_between_rollouts(evaluator: Evaluator) -> None:
     every_rollout = EvaluationCallback(evaluator, every=1)
     train(every_rollout)
     assert [e.steps for e in every_rollout.evaluations] == [0, 64, 128, 192, 256]
+
+
+@pytest.mark.parametrize(
+    ("every", "steps"),
+    [
+        pytest.param([[128, 64], [None, 128]], [0, 64, 128, 256], id="seldom later"),
+        pytest.param([[128, 1000], [None, 64]], [0, 256], id="an evaluation is due by the part the last one is in"),
+        pytest.param([(100, 64), (150, 10), (None, 100)], [0, 64, 128, 192, 256], id="three parts"),
+    ],
+)
+def test_evaluations_may_get_rarer_in_the_course_of_training(
+    evaluator: Evaluator, every: list, steps: list[int]
+) -> None:
+    callback = EvaluationCallback(evaluator, every)
+    train(callback)
+    assert [e.steps for e in callback.evaluations] == steps
+
+
+@pytest.mark.parametrize(
+    "every", [0, -1, True, "128", [], [[None, 0]], [[64, 32]], [[64, 32], [64, 32], [None, 64]], [[0, 1], [None, 64]],
+              [[None, 32], [None, 64]], [[64, 32, 1], [None, 64]], [64], None]
+)  # fmt: skip
+def test_a_schedule_that_is_none_is_refused(evaluator: Evaluator, every: object) -> None:
+    with pytest.raises(ValueError, match="every must be"):
+        EvaluationCallback(evaluator, every)
+
+
+def test_an_off_policy_algorithm_is_evaluated_with_its_present_policy_and_trains_as_without(
+    evaluator: Evaluator,
+) -> None:
+    def train(callback: EvaluationCallback | None) -> SAC:
+        model = SAC("MlpPolicy", gym.make(ENV_ID), learning_starts=20, seed=0, policy_kwargs={"net_arch": [16]})
+        return model.learn(50, callback=callback)
+
+    callback = EvaluationCallback(evaluator, every=20)
+    with_evaluation, without = train(callback), train(None)
+    assert [e.steps for e in callback.evaluations] == [0, 20, 40, 50]
+    assert callback.evaluations[-1].score == evaluator.score(evaluation.controller_of(with_evaluation))
+    assert len({e.score for e in callback.evaluations[1:]}) == 3
+    for name, value in with_evaluation.policy.state_dict().items():
+        assert torch.equal(value, without.policy.state_dict()[name]), name
 
 
 @pytest.mark.parametrize("policy", ["MlpPolicy", "MpcLcsPolicy"])
