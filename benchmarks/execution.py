@@ -65,7 +65,8 @@ def loky(jobs: int) -> Backend:
     """
     if jobs < 1:
         raise ValueError(f"jobs must be at least 1, got {jobs!r}")
-    return Backend("loky", {"inner_max_num_threads": 1, "initializer": _watcher(os.getpid())}, jobs)
+    options = {"inner_max_num_threads": 1, "initializer": _watcher(os.getpid()), "idle_worker_timeout": 86_400}
+    return Backend("loky", options, jobs)
 
 
 def ray(address: str | None = None, jobs: int | None = None) -> Backend:

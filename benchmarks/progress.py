@@ -74,7 +74,7 @@ class ProgressBar:
         jobs: int,
     ) -> None:
         self._left, self._under_way, self._jobs = dict(expected), under_way, jobs
-        self._end: float | None = None
+        self._console, self._total = console, len(expected)
         columns = (
             TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
             TextColumn("{task.fields[left]}"),
@@ -94,7 +94,11 @@ class ProgressBar:
     def advance(self, name: str) -> None:
         """A task is done."""
         self._left.pop(name)
-        self._progress.update(self._bar, advance=1, left=f"about {duration(self.seconds_left())} left")
+        left = f"about {duration(self.seconds_left())} left"
+        self._progress.update(self._bar, advance=1, left=left)
+        if not self._console.is_terminal:  # where a bar does not move, e.g. in a log
+            done = self._total - len(self._left)
+            self._console.print(f"{done}/{self._total} {name}; {left}", markup=False, highlight=False, soft_wrap=True)
 
     def seconds_left(self) -> float:
         """Expected seconds until all tasks are done."""

@@ -35,7 +35,7 @@ from benchmarks.training import Probed, SavedModel, Trained
 
 SCRATCH = Path("build/benchmark")
 PROBE_SECONDS = 20.0
-"""A guess, to tell how long it will take."""
+"""A guess of what a probe takes, to tell how long all of it will."""
 FAILED, BAD_ARGUMENTS, INTERRUPTED = 1, 2, 130
 """Exit statuses."""
 
@@ -207,7 +207,8 @@ def _reference_key(missing: Missing) -> tuple[str, int]:
 
 
 def _seconds(missing: Missing, costs: Costs) -> float:
-    return costs.of(missing.experiment) if missing.model is None else PROBE_SECONDS * len(missing.probes)
+    training_seconds = costs.of(missing.experiment) if missing.model is None else 0.0
+    return training_seconds + PROBE_SECONDS * len(missing.probes)
 
 
 def _task(missing: Missing, small: bool) -> Task:
