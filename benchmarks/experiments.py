@@ -48,7 +48,7 @@ ALGORITHMS = {
 """Name -> the module that has it, imported when needed."""
 MPC_POLICY = "MpcLcsPolicy"
 _NAME = re.compile(r"[a-z0-9_-][a-z0-9._-]*(/[a-z0-9_-][a-z0-9._-]*)*")
-_SMALL_STEPS = {MPC_POLICY: 256, "PPO": 2_048, "off-policy": 512}
+_SMALL_STEPS = {MPC_POLICY: 256, "PPO": 2_048, "CrossQ": 256, "off-policy": 512}  # CrossQ's networks are wide
 _SMALL_EPISODES = 4
 
 
