@@ -12,7 +12,7 @@ import contextlib
 import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from joblib import Parallel, delayed, parallel_config
@@ -21,35 +21,11 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from benchmarks import evaluation, runs
+from benchmarks import runs
 from benchmarks.evaluation import Evaluation, EvaluationCallback, Evaluator
 from benchmarks.references import lqr, oracle
 from benchmarks.runs import Row
-
-
-class Verdict(NamedTuple):
-    """What a run came to. ``None`` where it was never solved."""
-
-    rollouts: int | None
-    steps: int | None
-    seconds: float | None
-    held: bool
-    final: float
-    worst_after: float | None
-
-
-def verdict(evaluations: Sequence[Evaluation], oracle_score: float) -> Verdict:
-    """Judge a run by the protocol of :mod:`benchmarks.evaluation`."""
-    first = evaluation.solved(evaluations, oracle_score)
-    after = evaluation.after_solving(evaluations, oracle_score)
-    return Verdict(
-        rollouts=None if first is None else first.rollouts,
-        steps=None if first is None else first.steps,
-        seconds=None if first is None else first.seconds,
-        held=evaluation.held(evaluations, oracle_score),
-        final=evaluations[-1].score,
-        worst_after=min((e.score for e in after), default=None),
-    )
+from benchmarks.summary import Verdict, verdict
 
 
 def verdicts(rows: Sequence[Row]) -> dict[tuple[str, str, int], Verdict]:
