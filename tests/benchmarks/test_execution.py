@@ -66,13 +66,14 @@ def test_a_worker_that_dies_takes_no_other_task_with_it(backend: Backend) -> Non
         backend,
         Task("sleeper", time.sleep, (2.0,)),
         Task("dies", os._exit, (3,)),
-        *(Task(f"{i}", math.sqrt, (i,)) for i in range(4)),
+        *(Task(f"waits {i}", math.sqrt, (i,)) for i in range(4)),
     )
     failure = outcomes.pop("dies").failure
     assert failure is not None and failure.reason.startswith("its worker process died")
     assert all(outcome.failure is None for outcome in outcomes.values())
-    assert outcomes["3"].result == math.sqrt(3)
+    assert outcomes["waits 3"].result == math.sqrt(3)
     assert len(said) == 1 and "dies" in said[0] and "sleeper" in said[0]
+    assert "waits" not in said[0]
 
 
 def test_each_of_several_that_die_is_found(backend: Backend) -> None:

@@ -190,7 +190,8 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     calls: list[Any] = []
 
     def probe(model: Any, env_id: str, *, small: bool) -> list[dict[str, Any]]:
-        calls.append((env_id, small, model.get_vec_normalize_env() is not None))
+        normalization = model.get_vec_normalize_env()
+        calls.append((env_id, small, normalization and round(normalization.obs_rms.count)))
         return [
             {
                 "of": "weights",
@@ -216,7 +217,8 @@ def test_a_probe_added_later_needs_no_training(tmp_path: Path, asked: list[Any])
     (missing,) = found.missing(experiment("a", row | {"probes": ["robustness"]}))
     assert missing.model is not None and missing.probes == ("robustness",)
     run_missing(found, experiment("a", row | {"probes": ["robustness"]}))
-    assert asked == [(ENV_ID, False, True)] and found.store.runs("a") == before
+    assert asked == [(ENV_ID, False, 65)]  # observations of 64 steps and a reset
+    assert found.store.runs("a") == before
 
     # what it finds is what it finds right after training
     together = benchmark(tmp_path / "together")
