@@ -36,7 +36,7 @@ def across_tasks(rows: Sequence[Row | None]) -> np.ndarray | None:
     return np.array([[row.evaluations[seed][-1].score / row.oracle for row in known] for seed in seeds])
 
 
-def iqm(scores: Mapping[str, np.ndarray], reps: int = 10_000) -> dict[str, Interval]:
+def iqm(scores: Mapping[str, np.ndarray], reps: int = 2_000) -> dict[str, Interval]:
     """Interquartile means over all runs of all tasks: the mean of the middle half.
 
     :param scores: learner -> (n_seeds, n_tasks), see :func:`across_tasks`
@@ -49,7 +49,7 @@ def iqm(scores: Mapping[str, np.ndarray], reps: int = 10_000) -> dict[str, Inter
 
 
 def profile(
-    scores: Mapping[str, np.ndarray], thresholds: np.ndarray, reps: int = 1_000
+    scores: Mapping[str, np.ndarray], thresholds: np.ndarray, reps: int = 500
 ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Performance profiles: the share of runs that score above each threshold, (N,), and its interval, (2, N).
 

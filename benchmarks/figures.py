@@ -19,7 +19,7 @@ from benchmarks.aggregates import Interval
 from benchmarks.evaluation import SOLVED
 from benchmarks.plots import INK, LEARNED, QUIET, REFERENCES
 
-__all__ = ["Curve", "Dots", "Look", "Panel", "aggregates", "dots", "heat_maps", "learning"]
+__all__ = ["Curve", "Dots", "Look", "Panel", "aggregates", "dots", "episodes", "heat_maps", "learning"]
 
 _WIDTH = 8.0  # inches; at 800 pixels a point of type is 1.4 of them
 _SOLVED_LABEL = f"{100.0 * SOLVED:.0f} % of the oracle"
@@ -121,6 +121,29 @@ def _learning_panel(axes: Axes, panel: Panel, lowest: float) -> None:
     axes.grid(axis="y", color=QUIET, alpha=0.25, linewidth=0.8)
 
 
+# -- an episode --
+
+
+def episodes(path: Path, panels: Sequence[str], controllers: Sequence[tuple[Look, np.ndarray, np.ndarray]]) -> None:
+    """Draw an episode under several controllers.
+
+    :param path: of the PNG
+    :param panels: what is drawn in each
+    :param controllers: how each is drawn, (N,) times in seconds, and (n_panels, N) values
+    """
+    with _figure(path, 2.9) as figure:
+        grid = figure.subplots(1, len(panels), squeeze=False)[0]
+        for i, (axes, title) in enumerate(zip(grid, panels, strict=True)):
+            for look, times, values in controllers:
+                axes.plot(
+                    times, values[i], color=look.colour, linestyle=look.line, linewidth=look.width, label=look.label
+                )
+            axes.set_title(title, loc="left")
+            axes.set_xlabel("time, s")
+            axes.grid(axis="y", color=QUIET, alpha=0.25, linewidth=0.8)
+        figure.legend(*grid[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
+
+
 # -- a dot a run --
 
 
@@ -156,10 +179,13 @@ def dots(path: Path, rows: Sequence[Dots], lqr: float, lowest: float = 0.5) -> N
             best_shown, final_shown = np.maximum(best, lowest), np.maximum(final, lowest)
             axes.hlines(height + shift, final_shown, best_shown, color=LEARNED, alpha=0.35, linewidth=1.0)
             style: dict[str, Any] = {"color": LEARNED, "clip_on": False, "linestyle": "none", "markersize": 4.5}
-            axes.plot(best_shown, height + shift, "o", mfc="white", **style)
-            for inside, marker in ((final >= lowest, "o"), (final < lowest, "<")):
-                if inside.any():  # matplotlib leaves room for a line of no points
-                    axes.plot(final_shown[inside], (height + shift)[inside], marker, **style)
+            for score, there, marker, face in (
+                (best_shown, best >= lowest, "o", "white"),
+                (final_shown, final >= lowest, "o", LEARNED),
+                (final_shown, final < lowest, "<", LEARNED),
+            ):
+                if there.any():  # matplotlib leaves room for a line of no points
+                    axes.plot(score[there], (height + shift)[there], marker, mfc=face, **style)
         axes.set_yticks(range(len(rows)), [row.label for row in rows])
         axes.set_ylim(len(rows) - 0.4, -0.6)
         axes.set_xlim(lowest, max(1.04, *(float(row.best.max()) for row in rows)) + 0.01 * span)
@@ -217,7 +243,7 @@ def aggregates(
 
 
 def heat_maps(path: Path, panels: Mapping[str, tuple[Sequence[str], Sequence[str], np.ndarray]]) -> None:
-    """Draw a table of shares for each environment, dark where little is left.
+    """Draw a table of shares, in percent, for each environment, dark where little is left.
 
     :param path: of the PNG
     :param panels: title -> changes, controllers, and (n_changes, n_controllers) shares, not a number where unknown
@@ -225,15 +251,21 @@ def heat_maps(path: Path, panels: Mapping[str, tuple[Sequence[str], Sequence[str
     longest = max(len(changes) for changes, _, _ in panels.values())
     colours = matplotlib.colors.LinearSegmentedColormap.from_list("", ["#c8553d", "#f3dcc4", "#d9ebec", LEARNED])
     with _figure(path, 1.1 + 0.29 * longest) as figure:
-        grid = figure.subplots(1, len(panels), squeeze=False)[0]
+        widths = [len(controllers) for _, controllers, _ in panels.values()]
+        grid = figure.subplots(1, len(panels), squeeze=False, width_ratios=widths)[0]
         for axes, (title, (changes, controllers, shares)) in zip(grid, panels.items(), strict=True):
             axes.imshow(np.clip(shares, 0.0, 1.0), cmap=colours, vmin=0.0, vmax=1.0, aspect="auto")
             for (i, j), share in np.ndenumerate(shares):
-                text = "\N{EN DASH}" if np.isnan(share) else "< 0" if share < 0.0 else f"{100.0 * share:.0f} %"
+                text = "\N{EN DASH}" if np.isnan(share) else "< 0" if share < 0.0 else f"{100.0 * share:.0f}"
                 dark = share < 0.15 or share > 0.9
                 axes.text(j, i, text, ha="center", va="center", fontsize=9, color="white" if dark else INK)
-            axes.set_xticks(range(len(controllers)), [name.replace(" ", "\n") for name in controllers])
+            axes.set_xticks(range(len(controllers)), [_broken(name) for name in controllers])
             axes.set_yticks(range(len(changes)), changes)
             axes.tick_params(length=0, top=False, labelsize=9)
             axes.spines[:].set_visible(False)
             axes.set_title(title, loc="left")
+
+
+def _broken(label: str) -> str:
+    """A label on several lines, broken where the eye expects it."""
+    return label.replace("+ ", "+\n").replace(", ", ",\n").replace("informed ", "informed\n")

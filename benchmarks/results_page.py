@@ -193,6 +193,27 @@ def _draw_parts(results: Results, path: Path) -> bool:
     return bool(rows)
 
 
+EPISODE = {"state 0": "cart, m", "state 2": "pole's angle, rad", "reward": "reward of a step"}
+"""What is drawn of an episode of the cart-pole."""
+STEP = 0.01
+"""Seconds of a control step."""
+
+
+def _draw_episode(results: Results, path: Path) -> bool:
+    controllers = []
+    for row in results.rows(results.probed("episode")):
+        lines = results.probe(row.name, "episode") if row.env.startswith("CartPole") else []
+        if lines:
+            of_first = [line for line in lines if line["seed"] == lines[0]["seed"]]
+            found = {name: [line for line in of_first if line["quantity"] == name] for name in EPISODE}
+            times = STEP * np.array([line["step"] for line in found["reward"]], dtype=float)
+            values = np.array([[line["value"] for line in found[name]] for name in EPISODE], dtype=float)
+            controllers.append((look(row.name), times, values))
+    if controllers:
+        figures.episodes(path, list(EPISODE.values()), controllers)
+    return bool(controllers)
+
+
 def _draw_robustness(results: Results, path: Path) -> bool:
     known = results.lines(
         "robustness_references", env=str, controller=str, change=str, amount=float, quantity=str, value=float
@@ -303,6 +324,7 @@ FIGURES: dict[str, tuple[Callable[[Results, Path], bool], str, Source]] = {
     "learning": (_learning(EASY, -0.25), "score against training rollouts and environment steps", Source(EASY)),
     "contact": (_learning(CONTACT, -0.25), "the same where contact decides", Source(CONTACT)),
     "final": (_learning(LONG, 0.9), "score in long runs", Source(LONG)),
+    "episode": (_draw_episode, "an episode of two policies", Source(probe="episode")),
     "across": (_draw_across, "interquartile means and performance profiles", Source(ACROSS_ALL)),
     "parts": (_draw_parts, "scores of runs with one change", Source(ABLATION)),
     "robustness": (_draw_robustness, "what is left of the score under changes", Source(probe="robustness")),
