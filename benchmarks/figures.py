@@ -84,32 +84,39 @@ def learning(path: Path, rows: Sequence[Sequence[Panel]], lowest: float = -0.25)
     :param lowest: lower edge, as a share of the oracle's score; where it is negative, what is lower is drawn on it
     """
     with _figure(path, 0.9 + 2.5 * len(rows)) as figure:
-        grid = figure.subplots(len(rows), len(rows[0]), squeeze=False, sharey="row")
+        grid = figure.subplots(len(rows), len(rows[0]), squeeze=False, sharex="col", sharey="row")
         entries: dict[str, Any] = {}
         for axes_of_row, panels in zip(grid, rows, strict=True):
+            low, high = _limits(panels, lowest)
             for axes, panel in zip(axes_of_row, panels, strict=True):
-                _learning_panel(axes, panel, lowest)
+                _learning_panel(axes, panel, low)
                 entries |= dict(zip(*axes.get_legend_handles_labels()[::-1], strict=True))
+            axes_of_row[0].set_ylim(low, high + 0.06 * (high - low))
             axes_of_row[0].set_ylabel("score")
         columns = len(entries) if len(entries) <= 5 else 4
         figure.legend(entries.values(), entries.keys(), loc="outside lower center", ncols=columns, frameon=False)
 
 
-def _learning_panel(axes: Axes, panel: Panel, lowest: float) -> None:
-    oracle, low = panel.oracle, lowest * panel.oracle
+def _limits(panels: Sequence[Panel], lowest: float) -> tuple[float, float]:
+    """Scores at the lower edge, no lower than anything is, and at the highest curve or the oracle."""
+    quartiles = [curve.quartiles for panel in panels for curve in panel.curves]
+    edge = lowest * panels[0].oracle
+    low = max(edge, min(0.0, *(float(each.min()) for each in quartiles)))
+    return low, max(panels[0].oracle, *(float(each.max()) for each in quartiles))
+
+
+def _learning_panel(axes: Axes, panel: Panel, low: float) -> None:
+    oracle = panel.oracle
     colour, line = REFERENCES["oracle"]
     axes.axhspan(SOLVED * oracle, oracle, color=colour, alpha=0.15, linewidth=0.0, label=_SOLVED_LABEL)
     axes.axhline(oracle, color=colour, linestyle=line, linewidth=1.2, label="oracle")
     if np.isfinite(panel.lqr):
         colour, line = REFERENCES["LQR"]
         axes.axhline(panel.lqr, color=colour, linestyle=line, linewidth=1.2, label="LQR")
-    high = oracle
     for (label, colour, line, width), x, quartiles in panel.curves:
         first, median, third = np.maximum(quartiles, min(low, 0.0))
         axes.fill_between(x, first, third, color=colour, alpha=0.16, linewidth=0.0)
         axes.plot(x, median, color=colour, linestyle=line, linewidth=width, label=label, zorder=2 + width)
-        high = max(high, float(third.max()))
-    axes.set_ylim(low, high + 0.06 * (high - low))
     axes.set_xscale("log")
     axes.set_xlim(left=panel.start)
     axes.xaxis.set_major_locator(LogLocator())
