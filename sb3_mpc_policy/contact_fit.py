@@ -9,7 +9,8 @@ the gap nor the force is linear any more, and where a pole that leans on a wall 
   tells. Distance alone does not: a blow turns a pole fast, and it is no less linear for that;
 * what the curvature terms do not take up is noise, and is measured: it grows with the curvature.
 
-Contacts without evidence do nothing: ``C = 0``.
+Contacts without evidence do nothing: ``C = 0``. As long as the smooth model has hardly more data than coefficients its
+surprises are none, and no contact is looked for.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ __all__ = ["fit_contacts"]
 _BENT = 0.02  # curvature terms of this size, in typical steps, make a transition count a quarter
 _LEAST_NOISE = 0.02  # in typical steps
 _MEDIANS = 2.0  # noise, in medians of what is left of transitions like this one
+_PER_TERM = 4  # transitions, for each term of the smooth model, from which on it can be surprised
 _LEAST_WINDOW, _WINDOWS = 31, 20  # transitions that are alike: a twentieth of all, at least so many
 
 
@@ -59,7 +61,9 @@ def fit_contacts(
     rng = np.random.default_rng(len(data.s))  # not the global one, which the training has
     surprises = Surprises(z, smooth.surprise / unit, near, noise, drift, unit, rng)
     start, most = _hinges(lcs, unit), lcs.n_contacts - untested.n
-    found = find_hinges(surprises, most, start if start.n <= most else Hinges.none(lcs.n_states, z.shape[1]))
+    none = Hinges.none(lcs.n_states, z.shape[1])
+    enough = len(x) >= _PER_TERM * len(smooth.theta)
+    found = find_hinges(surprises, most, start if start.n <= most else none) if enough else none
     _assign(lcs, untested.plus(found.C * unit[:, None], found.P))
     return untested.n + found.n
 

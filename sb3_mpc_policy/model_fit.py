@@ -4,11 +4,13 @@ The controller works in a small region around its target, the first data come fr
 model fitted to all of them predicts well and controls badly: the pendulum's curvature and the walls' blows end up in
 A and B. So the fit looks for the *tangent* at the target, by robust local polynomial regression:
 
-* each transition counts by its distance from the target, exp(−½ |(s − target) / (2 scale)|²);
+* each transition counts by its distance from the target, exp(−½ |(s − target) / (w scale)|²), w = 2;
 * quadratic and cubic terms in (s, a) take part in the regression and are dropped from the result: curvature goes to
   them and not to A and B. A ridge gives them the prior of being small in scaled coordinates;
 * what the contacts of the current model explain is taken off first; transitions that still do not fit, unmodelled
-  contacts above all, are outliers: Cauchy weights, iteratively reweighted.
+  contacts above all, are outliers: Cauchy weights, iteratively reweighted;
+* outliers may be the majority, of a pole that leans on a wall for an episode, and fit one another. The reweighting
+  therefore starts close to the target, w = 1/2, and widens: what fits there is what the tangent is.
 
 The contacts C, D, E, F and c are fitted to what this leaves (contact_fit.py), or left to the gradient of eq (16).
 """
@@ -31,13 +33,13 @@ __all__ = ["MODEL_FITS", "fit_tangent"]
 # eq (16) changes the model.
 MODEL_FITS = ("contacts", "least_squares", "gradient")
 
-_WIDTH = 2.0  # of the region, in state scales
+_WIDTHS = (0.5, 0.7, 1.0, 1.4, 2.0)  # of the region, in state scales, one after the other
 _DEGREES = (2, 3)  # of the terms that take up curvature ...
 _MOST_TERMS = 300  # ... left out where there would be more of them than this
 _LINEAR_RIDGE = 1e-6
 _CURVATURE_RIDGE = 1e-3
 _ENOUGH = 4000  # transitions that the regression takes, at random, of more
-_REWEIGHTINGS = 30
+_REWEIGHTINGS, _BEFORE = 30, 4  # with the last width, and with each of those before
 _SETTLED = 1e-5  # relative change of the coefficients at which reweighting ends
 _INLIERS = 0.4  # share of the data that is taken for undisturbed
 _LEAST_RESIDUAL = 1e-3  # whitened: no data are trusted beyond this
@@ -132,24 +134,31 @@ def _robust_regression(x: np.ndarray, u: np.ndarray, y: np.ndarray) -> tuple[np.
     deviation = median_deviation(y)
     some = np.arange(n) if n <= _ENOUGH else np.random.default_rng(n).choice(n, _ENOUGH, replace=False)
     features, whitened = everything[some], y[some] / deviation
-    near = np.exp(-0.5 * np.square(x[some] / _WIDTH).sum(axis=1))
-    near /= near.max()
-
+    distance = np.square(x[some]).sum(axis=1)
     trust, theta = np.ones(len(some)), np.zeros((features.shape[1], y.shape[1]))
-    for _ in range(_REWEIGHTINGS):
-        last = theta
-        weighted = features * (near * trust)[:, None]
-        gram = weighted.T @ features + np.diag(ridge)
-        theta = np.linalg.solve(gram, weighted.T @ whitened)
-        # a transition that decides the fit alone has no residual: undo its leverage
-        leverage = (features * np.linalg.solve(gram, weighted.T).T).sum(axis=1)
-        error = np.linalg.norm(whitened - features @ theta, axis=1) / np.sqrt(np.maximum(1.0 - leverage, 1e-3))
-        size = max(1.5 * float(np.quantile(error, _INLIERS)), _LEAST_RESIDUAL)
-        if np.abs(theta - last).max() < _SETTLED * np.abs(theta).max():
-            break
-        trust = 1.0 / (1.0 + np.square(error / size))
+    for width in _WIDTHS:
+        near = np.exp(-0.5 * (distance - distance.min()) / width**2)
+        for _ in range(_REWEIGHTINGS if width == _WIDTHS[-1] else _BEFORE):
+            last = theta
+            weighted = features * (near * trust)[:, None]
+            gram = weighted.T @ features + np.diag(ridge)
+            theta = np.linalg.solve(gram, weighted.T @ whitened)
+            # a transition that decides the fit alone has no residual: undo its leverage
+            leverage = (features * np.linalg.solve(gram, weighted.T).T).sum(axis=1)
+            error = np.linalg.norm(whitened - features @ theta, axis=1) / np.sqrt(np.maximum(1.0 - leverage, 1e-3))
+            size = max(1.5 * _quantile(error, near, _INLIERS), _LEAST_RESIDUAL)
+            if np.abs(theta - last).max() < _SETTLED * np.abs(theta).max():
+                break
+            trust = 1.0 / (1.0 + np.square(error / size))
     theta = theta * deviation
     return theta, y - everything @ theta, everything[:, n_z + 1 :] @ theta[n_z + 1 :], size
+
+
+def _quantile(values: np.ndarray, weights: np.ndarray, share: float) -> float:
+    """The value that so large a share of the weight is at or below."""
+    order = np.argsort(values)
+    below = np.cumsum(weights[order])
+    return float(values[order][np.searchsorted(below, share * below[-1])])
 
 
 def _curvature(z: np.ndarray) -> list[np.ndarray]:
