@@ -27,7 +27,8 @@ __all__ = ["Hinges", "Surprises", "find_hinges"]
 
 _SHARE = 0.1  # of a surprise that a good explanation may leave
 _LOUD = 10.0  # noise levels from which on a transition is a surprise
-_WORTH = 3.0  # hinges explain as much as this many surprises that only they touch
+_WORTH = 3.0  # hinges explain as much as this many surprises that only they touch ...
+_WORTH_KEEPING = 1.0  # ... and those of the last fit as much as this many
 _SUDDEN = 0.5  # share of a surprise that its force may change by within a step
 _LEAST_NEAR = 1e-3  # the least that a surprise counts from which a hinge may be learned
 _STARTS, _SHORT, _LONG = 8, 10, 60
@@ -73,6 +74,15 @@ class Hinges(NamedTuple):
         """With one less."""
         keep = np.arange(self.n) != k
         return Hinges(self.C[:, keep], self.P[keep])
+
+    def absorbed(self, k: int) -> Hinges:
+        """With one less, whose part the one that pushes most like it takes over, if any does."""
+        rest, like = self.without(k), self.without(k).C.T @ self.C[:, k]
+        if not len(like) or like.max() < _LIKE:
+            return rest
+        P, j = rest.P.copy(), int(like.argmax())
+        P[j] += like[j] * self.P[k]
+        return Hinges(rest.C, P)
 
 
 class _Fit(NamedTuple):
@@ -199,29 +209,49 @@ class Surprises:
         row = -np.linalg.solve(weighted.T @ z + np.diag(ridge), weighted.T @ amount)
         return Hinges(direction[:, None], row[None])
 
-    def is_worth_it(self, fit: _Fit, k: int) -> bool:
-        """Whether hinge k opens the gap it acts in, and explains surprises near enough that the others do not."""
+    def without(self, fit: _Fit, k: int, iterations: int) -> _Fit:
+        """The best fit of the others than hinge k."""
+        fits = (self.evaluate(fit.hinges.without(k)), self.evaluate(fit.hinges.absorbed(k)))
+        return min((self.descend(one, iterations) for one in fits), key=lambda one: one.cost)
+
+    def is_worth_it(self, fit: _Fit, k: int, worth: float = _WORTH) -> bool:
+        """Whether hinge k opens the gap it acts in, and explains surprises near enough that the others do not.
+
+        :param worth: as many of them, at least
+        """
         C, P = fit.hinges
         touched = self.loud[fit.forces[self.loud, k] > 0.0]
         nearest = self.near[touched].max(initial=0.0)
         if nearest < _LEAST_NEAR or P[k, : len(C)] @ (self.unit * C[:, k]) <= 0.0:
             return False
-        rest = self.descend(self.evaluate(fit.hinges.without(k)), _SHORT)
+        rest = self.without(fit, k, _SHORT)
         gain = np.maximum(np.log1p(rest.excess) - np.log1p(fit.excess), 0.0)[touched].sum()
-        return bool(gain > _WORTH * np.log1p(_SHARE**-2.0) / 2.0 and rest.cost > fit.cost)
+        return bool(gain > worth * np.log1p(_SHARE**-2.0) / 2.0 and rest.cost > fit.cost)
 
 
 def find_hinges(surprises: Surprises, most: int, start: Hinges) -> Hinges:
     """The hinges that explain surprises best.
 
     :param most: number of hinges at most
-    :param start: hinges to try first, at most as many
+    :param start: those of the last fit, at most as many: tried first, and kept with less evidence than new ones need,
+        since a controller that knows a wall stays away from it
     """
     found = []
     for hinges in (start.normalised(), Hinges.none(len(start.C), start.P.shape[1])):
         begin = _pruned(surprises, surprises.descend(surprises.evaluate(hinges), _LONG))
         found.append(_pruned(surprises, _grown(surprises, begin, most)))
-    return min(found, key=lambda fit: fit.cost).hinges
+    return _kept(surprises, min(found, key=lambda fit: fit.cost), start.normalised(), most).hinges
+
+
+def _kept(surprises: Surprises, fit: _Fit, before: Hinges, most: int) -> _Fit:
+    """With those from before that still explain something."""
+    for C, P in zip(before.C.T, before.P, strict=True):
+        if fit.hinges.n == most:
+            break
+        trial = surprises.descend(surprises.evaluate(fit.hinges.plus(C[:, None], P[None])), _LONG)
+        if trial.cost < fit.cost and surprises.is_worth_it(trial, trial.hinges.n - 1, _WORTH_KEEPING):
+            fit = trial
+    return fit
 
 
 def _grown(surprises: Surprises, fit: _Fit, most: int) -> _Fit:
@@ -248,5 +278,5 @@ def _pruned(surprises: Surprises, fit: _Fit) -> _Fit:
         if surprises.is_worth_it(fit, k):
             k += 1
         else:
-            fit, k = surprises.descend(surprises.evaluate(fit.hinges.without(k)), _LONG), 0
+            fit, k = surprises.without(fit, k, _LONG), 0
     return fit
