@@ -228,6 +228,16 @@ def test_noise_in_the_data_is_not_taken_for_contact(share: float) -> None:
                 np.testing.assert_allclose(np.sort(positions(lcs)), [LEFT, RIGHT], atol=0.02 * RANGE)
 
 
+def test_no_contact_is_looked_for_before_the_smooth_model_can_be_surprised() -> None:
+    """It has 56 terms here; the transitions are of episodes that meet walls all the time."""
+    data = episodes(0, n=400, reach=(0.5, 0.8, 0.1, 0.2))
+    contact = np.flatnonzero(touching(data).any(axis=1))
+    free = np.flatnonzero(~touching(data).any(axis=1))
+    for n, found in ((200, False), (600, True)):
+        some = np.concatenate([contact[: n // 5], free[: n - n // 5]])
+        assert (fitted(data.take(some))[1] > 0) == found
+
+
 def test_contacts_that_the_data_refute_are_forgotten() -> None:
     lcs, found = fitted(episodes(0))
     assert found == 2 and fit_contacts(lcs, episodes(1, reach=(0.6, 0.8, 0.2, 0.5), far=True), ORIGIN) == 0

@@ -215,6 +215,24 @@ def test_what_a_start_lacks_is_added() -> None:
     assert_found(find_hinges(scene(walls("left", "right"), noise=0.01).surprises(), 2, start), "left", "right")
 
 
+def test_a_wall_of_the_start_is_kept_by_two_touches_that_would_make_no_new_one() -> None:
+    data = scene(walls("left", "right"))
+    touched = np.flatnonzero(walls("left").forces(data.z)[:, 0] > 0.0)
+    some = data.surprise.copy()
+    some[touched[2:]] = 0.0
+    rest = np.setdiff1d(np.arange(len(data.z)), touched[2:])  # as if the others had not happened
+    few = Scene(data.z[rest], some[rest], data.noise[rest]).surprises()
+    assert_found(find_hinges(few, 2, nothing()), "right")
+    assert_found(find_hinges(few, 2, walls("left", "right")), "left", "right")
+
+
+def test_a_wall_that_was_found_in_two_pieces_becomes_one() -> None:
+    whole = walls("left").normalised()
+    pieces = Hinges(np.hstack([whole.C, whole.C]), np.vstack([0.4 * whole.P, 0.6 * whole.P]))
+    np.testing.assert_allclose(pieces.absorbed(0).P, whole.P)
+    assert_found(find_hinges(scene(walls("left"), noise=0.01).surprises(), 2, pieces), "left")
+
+
 def test_a_wrong_start_does_no_harm() -> None:
     rng = np.random.default_rng(0)
     for _ in range(8):

@@ -111,6 +111,23 @@ def test_the_jacobian_at_the_target_is_found_in_spite_of_curvature_and_impacts(a
     assert errors[1] < 0.2 * plain[1] and errors[1] < 0.03
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_a_majority_that_leans_on_a_wall_does_not_decide_the_tangent(seed: int) -> None:
+    """Three transitions of four are of a pendulum pressed against a spring, and fit one another."""
+    rng = np.random.default_rng(seed)
+    free = rng.uniform([-0.25, -0.8], [0.25, 0.8], (100, 2))
+    leaning = rng.normal([0.55, 0.0], [0.01, 0.1], (300, 2))
+    s, a = np.concatenate([free, leaning]), rng.uniform(-1.0, 1.0, (400, 1))
+    s_next = pendulum(s, a)
+    push = -60.0 * STEP * np.maximum(s[:, 0] - 0.5, 0.0)
+    s_next += push[:, None] * [STEP, 1.0]
+    lcs = LinearComplementaritySystem(2, 1, 0, [0.2, 0.5], [1.0])
+    fit_tangent(lcs, transitions(s, a, s_next), np.zeros(2))
+    A, B = pendulum_jacobian(0.0)
+    np.testing.assert_allclose(lcs.A.detach(), A, atol=0.002)
+    np.testing.assert_allclose(lcs.B.detach(), B, atol=0.002)
+
+
 def test_the_offset_is_that_of_the_tangent_in_the_units_of_the_environment() -> None:
     rng = np.random.default_rng(2)
     s, a = rng.uniform([0.3, -1.0], [1.3, 1.0], (300, 2)), rng.uniform(-1.0, 1.0, (300, 1))
