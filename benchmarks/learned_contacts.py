@@ -3,7 +3,7 @@
     python -m benchmarks.learned_contacts --jobs 2
     python -m benchmarks.learned_contacts --jobs 2 --variant linear --eval-every 3840 --output LINEAR.csv
 
-Trains, with contacts in the model or without, and evaluates as :mod:`benchmarks.learn` does. At each evaluation the
+Trains, with contacts in the model or without, and evaluates as :mod:`benchmarks.run` does. At each evaluation the
 walls are read out of the model as well:
 
 * ``position``: where the gap closes along the first state (the cart with the pole upright, the acrobot's shoulder),
@@ -28,7 +28,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -38,7 +38,8 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from benchmarks import learn, runs
+from benchmarks import runs
+from benchmarks.console import summary as summary_of_runs
 from benchmarks.evaluation import Evaluation, EvaluationCallback, Evaluator
 from benchmarks.references import contact_env, lqr, oracle
 from contact_envs.cart_pole_soft_walls import CartPoleSoftWallsEnv
@@ -46,7 +47,8 @@ from sb3_mpc_policy import LinearComplementaritySystem
 from sb3_mpc_policy.lcs import LcsMatrices
 
 ENVS = ["CartPoleSoftWallsHardPyBullet-v0"]
-VARIANTS = ["tuned"]
+VARIANTS: dict[str, dict[str, Any]] = {"tuned": {}, "linear": {"policy_kwargs": {"n_contacts": 0}}}
+"""What each changes in the environment's tuned settings."""
 SEEDS = list(range(1000, 1010))
 TEST_SEEDS = range(2_000_000, 2_000_100)
 _TEST_NOISE = 0.3  # standard deviation of LQR's actions
@@ -154,7 +156,7 @@ def train(
                 readings.append(Reading(*at, wall.position, *found, error, true_error))
 
         callback = EvaluationCallback(evaluator, every, read)
-        settings = runs.settings_for(env_id, runs.named_variants()[variant])
+        settings = runs.settings_for(env_id, VARIANTS[variant])
         runs.train(env_id, settings, seed, steps, [callback])
     return runs.rows_of(callback, env_id, variant, seed, oracle_score), readings
 
@@ -191,7 +193,7 @@ def arguments(argv: Sequence[str] | None = None) -> argparse.Namespace:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--env", nargs="+", default=ENVS, metavar="ID")
-    parser.add_argument("--variant", nargs="+", default=VARIANTS, choices=sorted(runs.named_variants()))
+    parser.add_argument("--variant", nargs="+", default=["tuned"], choices=sorted(VARIANTS))
     parser.add_argument("--seeds", nargs="+", type=int, default=SEEDS, metavar="N")
     parser.add_argument("--steps", type=int, default=3_840, help="environment steps of each run")
     parser.add_argument("--eval-every", type=int, default=640, help="environment steps between evaluations")
@@ -233,7 +235,7 @@ def main(argv: Sequence[str] | None = None) -> tuple[list[runs.Row], list[Readin
             write_readings(args.output.with_stem(args.output.stem + "_walls"), readings)
             progress.advance(bar)
     for _, of_env in itertools.groupby(sorted(rows), key=lambda row: row.env):
-        console.print(learn.summary(list(of_env)))
+        console.print(summary_of_runs(list(of_env)))
     for _, of_one in itertools.groupby(sorted(readings), key=lambda line: line.env):
         console.print(summary(list(of_one), args.rollouts))
     console.print(f"{len(rows)} evaluations in {args.output}")

@@ -1,4 +1,4 @@
-"""One training run, and the table of settings that runs are made with."""
+"""One training run with the tuned settings or changed ones, and its result file."""
 
 from __future__ import annotations
 
@@ -16,8 +16,6 @@ from stable_baselines3.common.env_util import make_vec_env
 
 from benchmarks.evaluation import EvaluationCallback
 from sb3_mpc_policy import hyperparams
-
-VARIANTS = Path(__file__).parent / "variants.yml"
 
 
 class Row(NamedTuple):
@@ -57,11 +55,6 @@ def read_rows(path: Path) -> list[Row]:
 
 
 # -- settings --
-
-
-def named_variants() -> dict[str, dict[str, Any]]:
-    """The variants of ``variants.yml``: name -> what it changes."""
-    return yaml.safe_load(VARIANTS.read_text())
 
 
 def parsed_changes(assignments: Sequence[str]) -> dict[str, Any]:

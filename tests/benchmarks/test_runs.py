@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import learn, runs
+from benchmarks import console, runs
 from benchmarks.runs import Row
 
 ENV_ID = "CartPoleSoftWallsPyBullet-v0"
@@ -35,14 +35,6 @@ def test_changes_are_merged_key_by_key_and_leave_the_original_alone() -> None:
     assert settings["policy_kwargs"]["n_contacts"] == 2
 
 
-def test_every_named_variant_is_a_set_of_changes() -> None:
-    variants = runs.named_variants()
-    assert variants["tuned"] == {}
-    for name, changes in variants.items():
-        runs.settings_for(ENV_ID, changes)
-        assert isinstance(changes, dict), name
-
-
 def test_tuned_settings_are_for_the_mpc_policy_only() -> None:
     assert runs.settings_for(ENV_ID, {"policy": "MlpPolicy"}) == {"device": "cpu", "policy": "MlpPolicy"}
     tuned = runs.settings_for(ENV_ID, {})
@@ -51,37 +43,21 @@ def test_tuned_settings_are_for_the_mpc_policy_only() -> None:
 
 def test_a_result_file_reads_back_as_it_was_written(tmp_path: Path) -> None:
     written = rows("tuned", 1, 10.0, 960.25) + rows("tuned", 0, -12_345.5)
-    runs.write_rows(tmp_path / "new" / "learn.csv", written)
-    assert runs.read_rows(tmp_path / "new" / "learn.csv") == sorted(written)
+    runs.write_rows(tmp_path / "new" / "runs.csv", written)
+    assert runs.read_rows(tmp_path / "new" / "runs.csv") == sorted(written)
 
 
 def test_verdicts_judge_each_run_by_itself() -> None:
-    verdicts = learn.verdicts(rows("a", 0, 0, 960, 940, 910) + rows("a", 1, 990, 100, 990) + rows("b", 0, 0, 500))
-    assert verdicts[ENV_ID, "a", 0] == learn.Verdict(3, 128, 0.5, True, 910, 910)
-    assert verdicts[ENV_ID, "a", 1] == learn.Verdict(0, 0, 0.0, False, 990, 100)
-    assert verdicts[ENV_ID, "b", 0] == learn.Verdict(None, None, None, False, 500, None)
+    verdicts = console.verdicts(rows("a", 0, 0, 960, 940, 910) + rows("a", 1, 990, 100, 990) + rows("b", 0, 0, 500))
+    assert verdicts[ENV_ID, "a", 0] == console.Verdict(3, 128, 0.5, True, 910, 910)
+    assert verdicts[ENV_ID, "a", 1] == console.Verdict(0, 0, 0.0, False, 990, 100)
+    assert verdicts[ENV_ID, "b", 0] == console.Verdict(None, None, None, False, 500, None)
 
 
 def test_an_unsolved_run_counts_as_later_than_every_solved_one() -> None:
     """Rollouts to solve of 3, 6 and never: the median is 6, not the 4.5 of those that made it."""
-    table = learn.summary(rows("a", 0, 0, 990) + rows("a", 1, 0, 0, 990) + rows("a", 2, 0, 0, 0))
+    table = console.summary(rows("a", 0, 0, 990) + rows("a", 1, 0, 0, 990) + rows("a", 2, 0, 0, 0))
     cells = {column.header: list(column.cells)[-1] for column in table.columns}
     assert cells["seed"] == "median"
     assert cells["solved"] == "2/3"
     assert cells["rollouts"] == "6"
-
-
-def test_the_benchmark_runs_from_the_command_line(tmp_path: Path) -> None:
-    """Two short runs of a stock policy, in processes of their own, then the file and what is in it."""
-    output = tmp_path / "learn.csv"
-    found = learn.main(
-        f"--env {ENV_ID} --seeds 0 1 --steps 128 --eval-every 64 --episodes 2 --jobs 2 --output {output} "
-        "--set policy=MlpPolicy n_steps=64 batch_size=64".split()
-    )
-    assert runs.read_rows(output) == [
-        row._replace(seconds=round(row.seconds, 2), score=round(row.score, 2), oracle=round(row.oracle, 2))
-        for row in sorted(found)
-    ]
-    assert [(row.seed, row.steps) for row in sorted(found)] == [(s, t) for s in (0, 1) for t in (0, 64, 128)]
-    assert {row.variant for row in found} == {"tuned policy=MlpPolicy n_steps=64 batch_size=64"}
-    assert len({row.score for row in found}) == 6
