@@ -208,7 +208,6 @@ def test_numbers_are_shown_with_three_digits(value: float | None, shown: str) ->
 # -- what is committed --
 
 
-@pytest.mark.skipif(not (DOCS / PAGE).exists(), reason="the page is not committed yet")
 def test_the_committed_page_is_what_the_command_makes(tmp_path: Path) -> None:
     status, page = make(ROOT / "benchmarks" / "results" / "runs", tmp_path)
     assert status == 0
